@@ -1,9 +1,9 @@
 """Write the two bags of this folder: `walk` and `reach_squat`, ten seconds of procedural motion each, at 30 Hz.
 
-Joint angles come from curves (a gait cycle; eased key poses), and the root's translation from the ground: the sole that
-stands doesn't slide, and the lowest one touches the floor.
+Joint angles come from curves (a gait cycle; eased key poses). The root's translation follows from ground contact: the
+standing sole doesn't slide, and the lowest one touches the floor.
 
-The shipped `reach_squat` is older than the built-in body's shape directions: as its betas aren't zero, its hips differ
+The shipped `reach_squat` predates the built-in body's shape directions. Because its betas aren't zero, its hips differ
 by up to 0.0028 rad and its translation by 6 mm from what is written now; `walk`, whose betas are zero, by 2 µm.
 
     python bags/make_bags.py            # beside this script
@@ -34,8 +34,8 @@ FPS = 30
 SECONDS = 10
 START_NS = 1_700_000_000_000_000_000
 TOPIC = "/smpl_params"
-CHUNK_BYTES = 16 << 10  # small chunks: of a bag that was cut short, what is before the cut can still be read
-CONTACT_M = 0.004  # how near the floor a sole counts as standing on it
+CHUNK_BYTES = 16 << 10  # small chunks: if a bag is cut short, the chunks before the cut can still be read
+CONTACT_M = 0.004  # a sole this near the floor counts as standing on it
 LEG_M = 0.85
 Curve = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class Angles:
     rotations: dict[str, Rotation]
 
     def turn(self, joint: str, axis: str, degrees: Curve) -> None:
-        """Turn a joint about an axis of its parent, after the turns it has."""
+        """Turn a joint about an axis of its parent, on top of the turns it already has."""
         turn = Rotation.from_rotvec(np.radians(degrees)[:, None] * np.eye(3)["xyz".index(axis)])
         self.rotations[joint] = turn * self.rotations[joint] if joint in self.rotations else turn
 
@@ -112,7 +112,7 @@ def walk_pose(t: Curve) -> NDArray[np.float64]:
         angles.turn(f"{side}_knee", "x", gait(KNEE_FLEXION, cycle))
         angles.turn(f"{side}_ankle", "x", -gait(DORSIFLEXION, cycle))
         angles.turn(f"{side}_foot", "x", -gait(TOE_EXTENSION, cycle))
-        swing = -np.cos(2 * np.pi * cycle)  # against the leg of the same side
+        swing = -np.cos(2 * np.pi * cycle)  # opposite to the leg of the same side
         arm(angles, side, down=np.full_like(t, 66.0), forward=4 + 17 * swing, elbow=24 + 9 * swing)
     for joint, share in (("spine1", 0.3), ("spine2", 0.4), ("spine3", 0.7)):
         angles.turn(joint, "y", -share * 1.8 * yaw)
@@ -126,7 +126,7 @@ def reach_squat_pose(t: Curve) -> NDArray[np.float64]:
     body = load_body("male")
     ankles = [JOINT_NAMES.index(f"{side}_ankle") for side in ("left", "right")]
     abduction = np.full_like(t, 5.0)
-    for _ in range(8):  # the legs open just so much that the feet stay where they are
+    for _ in range(8):  # open the legs just far enough that the feet stay where they are
         pose = reach_squat_angles(t, abduction).pose(len(t))
         left, right = body(pose, betas=np.array([REACH_BETAS])).joints[:, ankles].double().numpy().transpose(1, 0, 2)
         width = left[:, 0] - right[:, 0]
@@ -195,7 +195,7 @@ def grounded_translation(pose: NDArray[np.float64], betas: NDArray[np.float64]) 
     step = soles[1:] - soles[:-1]
     shared = contact[1:] * contact[:-1]
     slip = (shared[:, :, None] * step).sum(axis=1) / shared.sum(axis=1)[:, None]
-    # Weight passes from foot to foot in a blink; the trunk, being heavy, doesn't follow so fast.
+    # Weight shifts from foot to foot in an instant; the heavy trunk can't follow that fast, so the motion is smoothed.
     transl = np.zeros((len(pose), 3))
     transl[1:] = -np.cumsum(gaussian_filter1d(slip, 0.8, axis=0, mode="nearest"), axis=0)
     transl[:, 1] = gaussian_filter1d(-soles[:, :, 1].min(axis=1), 0.8, mode="nearest")
@@ -204,7 +204,7 @@ def grounded_translation(pose: NDArray[np.float64], betas: NDArray[np.float64]) 
 
 
 def write_bag(path: Path, *, input_type: str, pose: NDArray[np.float64], betas: NDArray[np.float64]) -> None:
-    """One bag of a motion, as a rosbag2 directory."""
+    """Write one motion as a bag, a rosbag2 directory."""
     encode = encoder_for(input_type)
     transl = grounded_translation(pose, betas)
     with BagWriter(path, chunk_bytes=CHUNK_BYTES, overwrite=True) as bag:

@@ -5,8 +5,8 @@
     python bags/make_evaluation_bags.py data/outfit                              # eval_<outer>_over_<inner>
 
 A bag carries SMPL parameters with the style on /smpl_params and the simulated garments on /ground_truth, so
-`refu replay BAG --garments GARMENT,GARMENT` says how far (MPVE) a prediction is off. A garment is a marker of points:
-its triangles would take more than three times the room.
+`refu replay BAG --garments GARMENT,GARMENT` says how far off a prediction is (MPVE). A garment is a marker of points:
+its triangles would take more than three times the space.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ START_NS = 1_700_000_000_000_000_000
 TOPIC = "/smpl_params"
 SAMPLES_A_SECOND = 2
 TRUTH_EVERY = 3
-"""A sequence's ground truth is in each third frame: 10 a second."""
+"""In a sequence every third frame has ground truth: 10 a second."""
 SEQUENCE_SECONDS = 10.0
 PAUSE_NS = 2 * 10**9
-"""Between sequences."""
+"""Pause between two sequences."""
 MOST_BYTES = 8_000_000
 FrameAndTruth = tuple[SmplFrame, NDArray[np.float32] | None]
-"""A frame, and a row of the set, its garments at zero translation [m], shape (N, 3), where there is one."""
+"""A frame and its ground truth, if any: the vertices of all garments at zero translation [m], shape (N, 3)."""
 
 
 def spread_samples(dataset: GarmentDataset, count: int, seed: int) -> NDArray[np.intp]:
-    """Test samples, recorded and drawn ones and those of all style-shape pairs in their proportions.
+    """Test samples in which recorded and drawn poses and all style-shape pairs keep their proportions.
 
-    Every so-many-th of an ordered list, from a random one on.
+    They are evenly spaced in an ordered list, from a random start.
     """
     test = np.flatnonzero(dataset.test)
     recorded = dataset.column("clip")[test] >= 0
@@ -59,7 +59,7 @@ def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[F
     for k, index in enumerate(spread_samples(dataset, count, seed)):
         sample = dataset.sample(int(index))
         posed = body(sample.pose[None], torch.from_numpy(sample.betas)[None]).vertices[0]
-        # As round as the garment's own numbers: what isn't can hardly be compressed.
+        # Rounded like the garment's own numbers: unrounded ones hardly compress.
         height = np.round(-float(posed[:, 1].min()) / quantum) * quantum
         stamp = START_NS + k * 10**9 // SAMPLES_A_SECOND
         frame = SmplFrame(sample.pose, sample.betas, np.array([0, height, 0]), style=sample.style, stamp_ns=stamp)
@@ -67,9 +67,9 @@ def sample_moments(dataset: GarmentDataset, count: int, seed: int) -> Iterator[F
 
 
 def sequence_moments(sequences: GarmentSequences, *, seconds: float = SEQUENCE_SECONDS) -> Iterator[FrameAndTruth]:
-    """The test sequences that are simulated first, one at least, so many seconds of them with pauses in between.
+    """About `seconds` of the test sequences that are simulated first (one at least), with pauses in between.
 
-    Ground truth is in each third frame, as far as those are in the set.
+    Every third frame has ground truth, if that frame is in the set.
     """
     plan = SequencePlan(**sequences.card["plan"])
     numbers = [number for block in plan.blocks() for number in block if plan.split_of(number) == TEST]
@@ -86,7 +86,7 @@ def sequence_moments(sequences: GarmentSequences, *, seconds: float = SEQUENCE_S
 
 
 def write_bag(path: Path, parts: Mapping[str, slice], moments: Iterator[FrameAndTruth]) -> tuple[int, int]:
-    """One bag as a rosbag2 directory; returns the number of frames and of those with ground truth."""
+    """Write one bag, a rosbag2 directory; returns the number of frames and of those with ground truth."""
     encode = encoder_for("multiarray")
     colors = {garment: (*load_garment(garment).card.color, 1.0) for garment in parts}
     frames = truths = 0

@@ -1,9 +1,9 @@
-"""Encode and decode a garment's MarkerArray: ours beside rosbags', mcap-ros2's and rclpy's serialisation.
+"""Encode and decode a garment's MarkerArray: ours against rosbags', mcap-ros2's and rclpy's serialisation.
 
     python benchmarks/cdr.py [--garment skirt-female] [--repeat 200] [--json FILE]
 
-Every contender starts from the same vertices and ends with the message's bytes (or the other way round). Times are the
-processor's; the ratio is to our encoder's (decoder's) median in the same run.
+Every contender starts from the same vertices and ends with the message's bytes (or the other way round). Times are
+CPU times; the ratio is to our encoder's (decoder's) median in the same run.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-SLOW_RUNS = 5  # contenders take hundreds of milliseconds: a few runs tell
+SLOW_RUNS = 5  # the other contenders take hundreds of milliseconds: a few runs are enough
 Contender = tuple[str, str, "Callable[[], object]"]
 """Task, name, and what is timed."""
 
@@ -47,7 +47,7 @@ class SentGarment:
         self.data = self.encoder.encode([self.vertices], stamp_ns=0)
 
     def corner_points(self) -> list[tuple[float, float, float]]:
-        """What a message object is filled with: each triangle corner in ROS axes."""
+        """The points that fill a message object: each triangle corner in ROS axes."""
         points: list[tuple[float, float, float]] = (
             self.vertices[:, [2, 0, 1]].astype(np.float64)[self.faces.ravel()].tolist()
         )
@@ -55,7 +55,7 @@ class SentGarment:
 
 
 def ours(garment: SentGarment) -> Iterator[Contender]:
-    """The first row of each task: what the others are held against."""
+    """Our own contenders: the first row of each task, which the others are compared with."""
     transl = np.array([1.0, 0.9, -2.0])
 
     def decode() -> object:
@@ -67,7 +67,7 @@ def ours(garment: SentGarment) -> Iterator[Contender]:
 
 
 def rosbags(garment: SentGarment) -> Iterator[Contender]:
-    """Whose bytes must be ours."""
+    """rosbags' serialiser, whose bytes must equal ours."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -86,7 +86,7 @@ def rosbags(garment: SentGarment) -> Iterator[Contender]:
 
 
 def mcap_ros2(garment: SentGarment) -> Iterator[Contender]:
-    """Which only reads."""
+    """mcap-ros2-support, which only reads."""
     from mcap.records import Schema
     from mcap_ros2.decoder import DecoderFactory
 

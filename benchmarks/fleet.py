@@ -1,9 +1,9 @@
-"""What a fleet costs, on a quiet machine: two workers beside one, conversion beside the pipeline, memory over time.
+"""What a fleet costs, on a quiet machine: two workers against one, conversion against the pipeline, memory over time.
 
     python benchmarks/fleet.py [--only convert | workers | long] [--bags 20] [--frames 60] [--long 108000]
 
 Prints the share of the pipeline's speed that conversion reaches on the cores that it is given (taskset -c 0 for one);
-seconds a recording with one worker and with two, and whether results are the same bit for bit; and, with `--only long`,
+seconds per recording with one worker and with two, and whether the results are bit-identical; and, with `--only long`,
 the memory of a conversion over time.
 """
 
@@ -52,7 +52,7 @@ def _digest(folder: Path) -> str:
 
 
 def _workers(folder: Path, jobs: int) -> tuple[float, str]:
-    """Seconds of a run by so many workers that are up already, and a digest of the bags."""
+    """Seconds that `jobs` workers, already started, take for a run, and a digest of the bags."""
     recordings, out = find_recordings([str(folder / "bags")]), folder / f"out-{jobs}"
     options = FleetOptions(replay=ReplayOptions(input=Path()), output=str(out))
     with open_engine(jobs) as engine:
@@ -64,7 +64,7 @@ def _workers(folder: Path, jobs: int) -> tuple[float, str]:
 
 
 def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
-    """The pipeline alone and a conversion of the same frames, turn by turn: a machine's mood is shared by both."""
+    """Time the pipeline alone and a conversion of the same frames in turn, so that both see the same machine load."""
     options = ReplayOptions(input=folder / "part.mcap", output=folder / "out.mcap", evaluate=False, overwrite=True)
     pipeline = options.load_pipeline()
     part = frames[:150]
@@ -79,7 +79,7 @@ def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
         replay(options, pipeline=pipeline)
         after = [clock() for clock in clocks.values()]
         seconds.append((np.subtract(between, before), np.subtract(after, between)))
-    ms = 1e3 / len(part) * np.array(seconds[1:])  # the first round is for kernels and caches
+    ms = 1e3 / len(part) * np.array(seconds[1:])  # the first round warms up kernels and caches
     print(f"{len(os.sched_getaffinity(0))} cores, ms a frame, medians of {rounds} rounds (smallest share, largest)")
     for i, name in enumerate(clocks):
         alone, converted = ms[:, 0, i], ms[:, 1, i]
@@ -91,7 +91,7 @@ def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
 
 
 def _long(folder: Path, frames: list[SmplFrame], count: int, garments: tuple[str, ...], *, with_body: bool) -> None:
-    """Converts a recording of so many frames; its log memory.txt gets a line each half minute."""
+    """Converts a recording of `count` frames; the log memory.txt gets a line every half minute."""
     log, out = folder / "memory.txt", folder / "long-out.mcap"
     options = ReplayOptions(
         input=folder / "long.mcap",

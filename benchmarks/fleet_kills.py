@@ -1,11 +1,11 @@
-"""Simulated samples by two workers that are killed at random, beside one process: are the bytes the same?
+"""Simulate samples with two workers that are killed at random, and in one process: are the bytes the same?
 
     python benchmarks/fleet_kills.py GARMENT --folder DIR [--count 1000] [--every 60] [--scheduler-every 600]
 
-`refu simulate` runs twice at a time: alone, and with `--scheduler` on a cluster of this machine whose workers get
-SIGKILL at random, on average every so many seconds, and now and then the scheduler does, after which the same command
-is given again. Prints how often that was, and whether all rows are the same. The same command goes on with what is in
-DIR; a small garment makes it cheap (docs/guide/fleets.md).
+`refu simulate` runs twice at the same time: alone, and with `--scheduler` on a cluster on this machine. Its workers get
+SIGKILL at random, on average every `--every` seconds. Now and then the scheduler does too, and the same command is
+given again. Prints how many were killed, and whether all rows are the same. Run again, this script goes on with what
+is in DIR; a small garment makes it cheap (docs/guide/fleets.md).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ REFU = [sys.executable, "-m", "refu_lab.cli"]
 
 
 class Cluster:
-    """A scheduler and two workers, processes of this machine."""
+    """A scheduler and two workers as processes on this machine."""
 
     def __init__(self, folder: Path) -> None:
         self.file = folder / "scheduler.json"
@@ -52,21 +52,21 @@ class Cluster:
             )
 
     def kill_a_worker(self) -> None:
-        """One of the two; another one takes its place."""
+        """Kill one of the two; a new one takes its place."""
         k = random.randrange(2)
         self.workers[k].kill()
         self.workers[k].wait()
         self.workers[k] = self._worker()
 
     def kill(self) -> None:
-        """The scheduler, and its workers with it."""
+        """Kill the scheduler and its workers."""
         for process in (self.scheduler, *self.workers):
             process.kill()
             process.wait()
 
 
 def _same(first: Path, second: Path) -> tuple[int, bool]:
-    """Rows that both sets have, and whether they are the same in all but the seconds that they took."""
+    """How many rows both sets have, and whether these agree in everything but the seconds they took."""
     names = sorted(path.name for path in (first / ROWS).glob("*.npy") if path.name != "seconds.npy")
     sets = [{name: np.load(folder / ROWS / name, mmap_mode="r") for name in names} for folder in (first, second)]
     both = np.flatnonzero((sets[0]["state.npy"] > 0) & (sets[1]["state.npy"] > 0))

@@ -3,9 +3,9 @@
     python benchmarks/node.py                              # one person, T-shirt and short pant at 30 Hz, 60 s
     python benchmarks/node.py --persons 4 --rate 10        # four persons, two garments each
     python benchmarks/node.py --nobody                     # nobody listens: what the node costs then, and how long
-                                                           # viewers wait that come late
-    python benchmarks/node.py --nobody -p lazy:=false      # the same of a node that stays subscribed
-    python benchmarks/node.py --points                     # who subscribes reads points, typed, and not markers
+                                                           # late viewers wait
+    python benchmarks/node.py --nobody -p lazy:=false      # the same for a node that stays subscribed
+    python benchmarks/node.py --points                     # the subscriber reads typed points instead of markers
 
 Prints how many frames came out, latencies from the sender's stamp to the subscriber, whether they grow, how long the
 node takes to answer parameter changes meanwhile, and its share of a core. Needs rclpy (extra `ros`).
@@ -30,7 +30,7 @@ GARMENTS = ("tshirt-male", "short-pant-male")
 LATE_VIEWERS = 12
 UNTIL_KILLED_S = 3600.0
 REST_S = 8.0
-"""The node stays subscribed for some seconds after the last viewer; in this time it has unsubscribed [s]."""
+"""The node stays subscribed for some seconds after the last viewer leaves; after this time it has unsubscribed [s]."""
 
 
 def names(persons: int) -> list[str]:
@@ -82,7 +82,7 @@ def pose(t: float) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def receive(options: argparse.Namespace) -> dict[str, Any]:
-    """The subscriber: raw bytes of markers, or typed messages of points, looked at as arrays."""
+    """The subscriber: raw bytes of markers, or typed messages of points, read as arrays."""
     import rclpy
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import PointCloud2
@@ -143,7 +143,7 @@ def processor_seconds(process: subprocess.Popen[bytes]) -> dict[str, float]:
 
 
 def share_of_core(before: dict[str, float], after: dict[str, float], seconds: float) -> dict[str, float]:
-    """Of all threads, and of each that has used any [%]."""
+    """Share of a core that all threads used together, and that each busy thread used [%]."""
     used = {name: 100 * (value - before.get(name, 0.0)) / seconds for name, value in after.items()}
     each = {name: round(value, 2) for name, value in sorted(used.items(), key=lambda item: -item[1]) if value > 0.005}
     return {"all": round(sum(used.values()), 2), **each}
@@ -151,7 +151,7 @@ def share_of_core(before: dict[str, float], after: dict[str, float], seconds: fl
 
 def wait(options: argparse.Namespace, node: subprocess.Popen[bytes]) -> dict[str, Any]:
     """The node's share of a core while frames are sent and nobody listens; then, how long late viewers wait."""
-    time.sleep(25.0)  # until everything has started and found each other, and the node rests
+    time.sleep(25.0)  # until the processes have started and found each other, and the node is idle
     used, start = processor_seconds(node), time.monotonic()
     time.sleep(options.seconds)
     share = share_of_core(used, processor_seconds(node), time.monotonic() - start)
@@ -159,7 +159,7 @@ def wait(options: argparse.Namespace, node: subprocess.Popen[bytes]) -> dict[str
 
 
 def late_viewers() -> list[int]:
-    """How long somebody whose program runs already waits for a first garment after subscribing, time and again [ms]."""
+    """How long a viewer that already runs waits for a first garment after subscribing, `LATE_VIEWERS` times [ms]."""
     import rclpy
     from rclpy.qos import QoSProfile
     from visualization_msgs.msg import MarkerArray
@@ -179,7 +179,7 @@ def late_viewers() -> list[int]:
 
 
 def operate(sender: subprocess.Popen[bytes], of_node: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """Changes parameters while frames flow, and keeps the node's last word about itself."""
+    """Changes parameters while frames flow, and keeps the node's latest diagnostics."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from rcl_interfaces.srv import SetParameters

@@ -1,10 +1,10 @@
-"""How true and how fast the outputs for robots are, on held-out simulated cloth; docs/guide/outputs.md has the figures.
+"""How accurate and fast the outputs for robots are, on held-out simulated cloth; docs/guide/outputs.md has the figures.
 
     python benchmarks/outputs.py                  # all parts, some minutes
     python benchmarks/outputs.py openings times   # some of them
 
-Truth is that of the test samples in bags/eval_*. What was tuned or fitted saw every other style-shape pair of a bag;
-figures are of the rest. Times are medians on one thread.
+Ground truth is the test samples in bags/eval_*. Whatever was tuned or fitted used every other style-shape pair of a
+bag; its figures are for the rest. Times are medians on one thread.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def bag_of(garment: str) -> Path:
 
 
 def openings() -> None:
-    """Centres and normals beside those of the simulated garment, and how steady they are."""
+    """Centres and normals compared with those of the simulated garment, and how steady they are."""
     for garment in GARMENTS:
         pipeline = GarmentPipeline.load([garment])
         of = Openings(pipeline.garments[garment])
@@ -73,7 +73,7 @@ def openings() -> None:
 
 
 def steadiness() -> None:
-    """Someone stands; each joint is measured anew in each frame, wrong by so much."""
+    """How steady openings are on someone standing still, whose joints are measured with a new error in each frame."""
     rng = np.random.default_rng(0)
     for outfit in (["tshirt-male", "short-pant-male"], ["skirt-female"]):
         pipeline = GarmentPipeline.load(outfit)
@@ -100,7 +100,7 @@ def steadiness() -> None:
 
 
 def planner() -> None:
-    """How far solid and garment are from each other, beyond the half thickness."""
+    """How far the planner's solid and the garment are apart, beyond half the thickness."""
     for garment in GARMENTS:
         pipeline = GarmentPipeline.load([garment])
         template = pipeline.garments[garment]
@@ -124,7 +124,7 @@ def planner() -> None:
 
 
 def sigma() -> None:
-    """How often a 90 % interval holds on a style-shape pair, fitted to all the others."""
+    """How often a 90 % interval holds on a style-shape pair when it is fitted to all the others."""
     for garment in GARMENTS:
         samples = held_out(bag_of(garment), garment)
         found, share = load_sigma(samples.garment), cross_checked(samples)
@@ -143,7 +143,7 @@ def measured(depth: NDArray[np.float32], camera: PinholeCamera, rng: np.random.G
 
 
 def observation() -> None:
-    """How far the cloth that a camera sees is from the garment, without its points and with them."""
+    """How far the cloth that a camera sees is from the predicted garment, without the camera's points and with them."""
     for garment in GARMENTS:
         pipeline = GarmentPipeline.load([garment])
         moments = moments_of(bag_of(garment), pipeline.garments[garment])
@@ -174,7 +174,7 @@ def _follow(pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *
             return 1e3 * float(np.sqrt(square).mean())
 
         plain.append(off(out[garment].local))
-        if keeps and len(plain) % 5 == 0:  # nothing is measured in every fifth frame: what was learnt has to do
+        if keeps and len(plain) % 5 == 0:  # every fifth frame has no points: what was learnt has to suffice
             foreseen.append((plain[-1], off(observer(moment.frame)[garment].local)))
             continue
         done = observer(moment.frame, points + moment.frame.transl, eye=eye + moment.frame.transl)
@@ -193,7 +193,7 @@ def _follow(pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *
 
 
 def times() -> None:
-    """Each part on the T-shirt and shorts of one person."""
+    """Times each part on the T-shirt and shorts of one person."""
     pipeline = GarmentPipeline.load(["tshirt-male", "short-pant-male"])
     shirt = pipeline.garments["tshirt-male"]
     pose = np.zeros((24, 3))

@@ -1,9 +1,9 @@
-"""What half and twice of each number of the collider and of contact do on recorded motion, and what the collider costs.
+"""What halving and doubling each number of the collider and of contact do on recorded motion; the collider's cost.
 
     python benchmarks/sensitivity.py collider MOTIONS   # collider.md and collider.json
     python benchmarks/sensitivity.py contact MOTIONS    # contact.md
 
-MOTIONS is a folder of AMASS-style npz files at 60 Hz; every so many frames one is judged, and none is left out.
+MOTIONS is a folder of AMASS-style npz files at 60 Hz; one in `--every` frames is judged, and none of these is left out.
 Figures of contact are those of `refu evaluate --table motion`, in mode `hybrid` with β = 0.
 """
 
@@ -31,7 +31,7 @@ from refu_lab.tables import TextTable, write_json, write_page
 
 
 def changes(settings: Any) -> Iterator[tuple[str, str, Any]]:
-    """The default, then half and twice of each number; whole ones stay whole, even ones even, and none is zero."""
+    """The default, then each number halved and doubled; integers stay integers, even ones even, and none becomes 0."""
     yield "default", "", settings
     for field in fields(settings):
         value = getattr(settings, field.name)
@@ -68,7 +68,7 @@ Cost by the plain query of a T-shirt: {motion:.3f} in motion, {nothing_near:.3f}
 
 
 class ColliderBench:
-    """Poses of clips, sampled, and what the collider does to them."""
+    """Poses sampled from clips, and what the collider does to the skin in them."""
 
     def __init__(self, clips: list[Motion], every: int) -> None:
         self.body: SmplBody = load_body("male")
@@ -109,7 +109,7 @@ class ColliderBench:
         return skin.vertices[0].numpy(), collider(skin.vertices, skin.transforms)[0].numpy()
 
     def cost(self) -> dict[str, float]:
-        """The collider's time by that of the plain query of a T-shirt (BVH refitted, every vertex asked), medians."""
+        """Median time of the collider over that of a T-shirt's plain query (BVH refitted, every vertex queried)."""
         collider, garment = Collider(self.body), load_garment("tshirt-male")
         plain = sdf_methods(self.body, garment, network=False)[0][0].ask
         rest, betas = self.body(pose=np.zeros((1, 24, 3))), torch.zeros(10)
@@ -147,7 +147,7 @@ def write_collider(clips: list[Motion], every: int, folder: Path) -> None:
 
 TOGETHER, SKIRT = ("shirt-male", "short-pant-male"), ("skirt-female",)
 OF_TOGETHER = ("`layer_", "`alike", "`levellings")
-"""Beginnings of names of what matters to garments worn together alone."""
+"""Prefixes of the settings that matter only to garments worn together."""
 OF_CONTACT = {
     "cfmp_percent": ("free %", "{:.1f}"),
     "max_depth_mm": ("deepest mm", "{:.1f}"),

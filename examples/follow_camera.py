@@ -1,4 +1,4 @@
-"""Garments that follow a depth camera: here it sees shorts that are wider than the network knows.
+"""Garments that follow a depth camera: here it sees shorts that are wider than the network predicts.
 
 python examples/follow_camera.py
 """
@@ -13,7 +13,7 @@ from refu_core.outputs import PinholeCamera, depth_image
 
 
 def main() -> None:
-    """Prints how far the garment is from the points, without them and with them."""
+    """Prints how far the garment is from the true shorts, without the camera's points and with them."""
     pipeline = GarmentPipeline.load(["short-pant-male"])
     (name,) = pipeline.garments
     observer = Observer(pipeline)  # one for each person: it remembers
@@ -25,7 +25,7 @@ def main() -> None:
         frame = SmplFrame(pose=pose, transl=[0.0, 1.0, 0.0], stamp_ns=k * 33_000_000)
         plain = pipeline(frame)
 
-        # In place of a camera's driver: the same shorts, 15 mm wider in front, as a depth picture.
+        # Stands in for a camera's driver: a depth picture of the same shorts, 15 mm wider in front.
         true = plain[name].vertices
         true = true + 0.015 * (true[:, 2:] > true[:, 2].mean()) * np.array([0.0, 0.0, 1.0])
         camera = PinholeCamera.looking_at(true.mean(0), [0.4, 1.3, 2.0], width=320, height=240)

@@ -1,4 +1,4 @@
-"""Contact on a mesh of your own: a tube of cloth, without skinning weights or networks, is brought off a body.
+"""Contact on a mesh of your own: a tube of cloth, without skinning weights or networks, is moved off a body.
 
 python examples/own_mesh.py [GARMENT.obj]
 """
@@ -38,7 +38,7 @@ def main(path: str | None = None) -> tuple[int, int]:
 
     sdf = ExactSdf(body.faces)
     sdf.update(skin)
-    resolver = Resolver(faces, len(vertices))  # once a garment
+    resolver = Resolver(faces, len(vertices))  # once per garment
     done = resolver(vertices, sdf, sdf.query(vertices), margin=0.004)  # every frame
 
     checker = CollisionChecker(body.faces)

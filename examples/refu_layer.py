@@ -1,4 +1,4 @@
-"""The paper's layer inside a network of your own: trained end to end, what it predicts is off the body.
+"""The paper's layer inside a network of your own: trained end to end, its predictions stay off the body.
 
 python examples/refu_layer.py
 """

@@ -1,4 +1,4 @@
-"""What a robot asks of a dressed person: openings, clearance, contacts, a planner's mesh, and how sure all that is.
+"""What a robot wants to know of a dressed person: openings, clearance, contacts, a planner's mesh, and their certainty.
 
 python examples/robot_outputs.py
 """
@@ -12,7 +12,7 @@ from refu_core.outputs import Clearance, LimbContacts, Openings, PinholeCamera, 
 
 
 def main() -> None:
-    """Prints what there is to say of one frame."""
+    """Prints all of these for one frame."""
     pipeline = GarmentPipeline.load(["short-pant-male"])
     (garment,) = pipeline.garments.values()
     openings, planner = Openings(garment), PlannerMesh.of(pipeline, garment.name)  # once for each garment

@@ -12,7 +12,7 @@ from refu_core.sdf import ExactSdf
 
 
 def rounded(vector: torch.Tensor) -> list[float]:
-    """To three digits."""
+    """The components, rounded to three decimals."""
     return [round(x, 3) for x in vector.tolist()]
 
 

@@ -29,13 +29,13 @@ OWN = {
     "in_place": ("true", "hold the person at the place of the first frame"),
     "rviz": ("true", "start RViz2; the demo ends when it is closed"),
 }
-"""Arguments of the demo alone; all of garments.launch.py's are the demo's, too."""
+"""Arguments of the demo alone; it also takes all those of garments.launch.py."""
 SHARED = {
     "input_type": ("multiarray", "message that carries the body: multiarray, joint_state, pose_array, smpl_msgs"),
     "input_axes": ("smpl", "axes that are sent: smpl (y up; files are turned), or frame (as a file has them)"),
     "frame_id": ("map", "frame of the garments"),
 }
-"""Arguments that the player and the viewer have to know, too, with the values that all of them begin with."""
+"""Arguments that the player and the viewer need as well, with the defaults that the node shares with them."""
 
 
 FOLLOWED = ("namespace", "persons", "follow_humans", "use_sim_time", "input_topic", "output_topic", "body_topic")
@@ -53,23 +53,23 @@ def missing(package: str) -> str:
 
 
 def is_true(text: str) -> bool:
-    """As launch's own conditions have it."""
+    """Whether launch's own conditions take the text as true."""
     return text.strip().lower() in ("true", "1")
 
 
 def check(context: LaunchContext) -> None:
-    """Raises before anything runs: what launch has started by then would be left running."""
+    """Raises before anything is started: on an error, launch leaves running what it has started."""
     if LaunchConfiguration("bag").perform(context) and (problem := missing("ros2bag")):
         raise RuntimeError(problem)
 
 
 def ends_the_demo(reason: str) -> Callable[..., Shutdown | None]:
-    """For a process's `on_exit`; launch stumbles over being shut down twice."""
+    """A process's `on_exit` that ends the demo, but only once: launch stumbles over a second shutdown."""
     return lambda _event, context: None if context.is_shutdown else Shutdown(reason=reason)
 
 
 def player(given: dict[str, str]) -> LaunchDescriptionEntity:
-    """What sends the motion, to where the node listens."""
+    """The process that sends the motion, on the topics the node listens to."""
     end = ends_the_demo("the player has ended")
     sim_time = is_true(given["use_sim_time"])
     if given["bag"]:
@@ -94,7 +94,7 @@ def player(given: dict[str, str]) -> LaunchDescriptionEntity:
 
 
 def viewer(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
-    """RViz2, and the frame it shows, which on a robot is in the tree already; nothing where they aren't installed."""
+    """RViz2 and a transform for the frame it shows (a robot's tree has one); empty if either isn't installed."""
     problems = [problem for package in ("rviz2", "tf2_ros") if (problem := missing(package))]
     for problem in problems:
         get_logger("demo").warning(f"{problem}; going on without a viewer, as with rviz:=false")

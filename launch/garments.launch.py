@@ -30,7 +30,7 @@ OTHERS = {
 
 
 def parsed(name: str, text: str) -> Any:
-    """A parameter's value as its default's type has it."""
+    """A parameter's text as a value of its default's type."""
     default = DEFAULTS.get(name, False)
     if isinstance(default, str):
         return text
@@ -49,7 +49,7 @@ def parsed(name: str, text: str) -> Any:
 
 
 def node(context: LaunchContext) -> list[LifecycleNode]:
-    """The node with the file of parameters, and on top of it only those that were given on the command line."""
+    """The node with the file of parameters, overridden only by those given on the command line."""
     given = {name: LaunchConfiguration(name).perform(context) for name in (*DEFAULTS, "use_sim_time", *TOPICS)}
     return [
         LifecycleNode(

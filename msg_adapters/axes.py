@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 WORLD_FRAME = "map"
-"""The frame of whatever names no other (REP-105)."""
+"""The frame of anything that names no other (REP-105)."""
 
 InputAxes = Literal["smpl", "frame"]
 """What a sender's root orientation and translation are expressed in.
 
 `smpl`: SMPL's world, y up; vertices are permuted into ROS axes. `frame`: the axes of `frame_id` already, as pose
-estimators do with a camera's optical frame (and AMASS with its z-up world); vertices go out as they are.
+estimators send (a camera's optical frame) and AMASS has (its z-up world); vertices go out unchanged.
 """
 
 SMPL_COLUMNS: dict[InputAxes, tuple[int, int, int]] = {"smpl": (2, 0, 1), "frame": (0, 1, 2)}
-"""Column of SMPL that becomes the message's x, y and z."""
+"""SMPL's columns that become the message's x, y and z."""
 
 
 def ros_from_sender(axes: InputAxes) -> NDArray[np.float64]:
@@ -27,14 +27,14 @@ def ros_from_sender(axes: InputAxes) -> NDArray[np.float64]:
 
 
 def up_of(frame_id: str) -> NDArray[np.float64]:
-    """Which way is up in a frame, shape (3,), as REP-103 has it: -y in a camera's optical frame, z in any other."""
+    """Which way is up in a frame, shape (3,), following REP-103: -y in a camera's optical frame, z in any other."""
     return np.array([0.0, -1.0, 0.0] if "optical" in frame_id.rsplit("/", maxsplit=1)[-1] else [0.0, 0.0, 1.0])
 
 
 def up_of_sender(axes: InputAxes, frame_id: str, turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Which way is up in the axes of a sender's roots, shape (3,), where `turn` (3, 3) leads from its frame to another.
+    """Which way is up in the axes of a sender's roots, shape (3,); `turn` (3, 3) leads from its frame to `frame_id`.
 
-    Where `turn` leads nowhere else, SMPL's axes have y up whatever the frame is called.
+    If `turn` is the identity, SMPL's axes have y up whatever the frame is called.
     """
     if axes == "smpl" and (turn == np.eye(3)).all():
         return np.array([0.0, 1.0, 0.0])

@@ -11,7 +11,7 @@ from msg_adapters.errors import DecodeError
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _MOST_PIXELS = 1 << 15
-"""Of a picture's width or height: what is seen is drawn, and a picture has to fit into memory."""
+"""Largest width or height of a picture: what the camera sees is drawn into one, which has to fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Camera:
 
 
 def decode_camera_info(data: Buffer) -> Camera:
-    """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` for one uncalibrated, or too large."""
+    """The camera of a `sensor_msgs/CameraInfo` in CDR. Raises `DecodeError` if it is uncalibrated or too large."""
     reader = CdrReader(data)
     _, frame_id, height, width, _ = reader.fields("TsIIs")
     reader.array("f8", reader.length(item_bytes=8))

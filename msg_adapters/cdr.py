@@ -46,13 +46,13 @@ class CdrReader:
         return self._at
 
     def since(self, place: int) -> tuple[str, bytes]:
-        """What was read since then, with the byte order: the same again is the same fields again, see `repeats`."""
+        """The bytes read since `place`, with their byte order: equal bytes hold equal fields, see `repeats`."""
         return self._order, bytes(self._data[place : self._at])
 
     def repeats(self, known: tuple[str, bytes]) -> bool:
-        """Whether what `since` gave of another message comes next; if so it is skipped.
+        """Whether the bytes that `since` gave for another message come next; if so they are skipped.
 
-        Both must begin where the strictest of their alignments is satisfied.
+        Both must begin where the strictest alignment of their fields is satisfied.
         """
         order, raw = known
         if order != self._order or bytes(self._data[self._at : self._at + len(raw)]) != raw:
@@ -103,7 +103,7 @@ class CdrReader:
         return int(count)
 
     def string(self) -> str:
-        """A string: its length with the final NUL, the bytes in UTF-8."""
+        """A string: its length including the final NUL, then the bytes in UTF-8."""
         raw = self.skip(self.length(item_bytes=1))
         if not raw:
             return ""  # some senders write an empty string without its NUL
@@ -133,7 +133,7 @@ class CdrReader:
         return int(seconds) * NS_PER_S + int(nanoseconds)
 
     def finish(self) -> None:
-        """The message must end here, but for a few bytes of padding."""
+        """Check that the message ends here, apart from a few bytes of padding."""
         if self.remaining > _MAX_TRAILING:
             msg = f"{self.remaining} bytes follow the message's last field; is it of another type?"
             raise DecodeError(msg)
@@ -154,7 +154,7 @@ class CdrWriter:
         self._payload += bytes(-len(self._payload) % size)
 
     def fields(self, codes: str, *values: Any) -> int:
-        """Append fields by their codes, as `CdrReader.fields` has them; returns the payload offset of the first one."""
+        """Append fields by their codes, as in `CdrReader.fields`; returns the payload offset of the first one."""
         start = -1
         for code, value in zip(codes, values, strict=True):
             if code == "s":
@@ -174,7 +174,7 @@ class CdrWriter:
         return start
 
     def _string(self, text: str) -> int:
-        """UTF-8 with its length and final NUL."""
+        """Append the text in UTF-8, with its length and a final NUL."""
         try:
             raw = text.encode() + b"\0"
         except UnicodeEncodeError as error:

@@ -1,7 +1,8 @@
 """Definitions of the messages this project reads and writes, as ROS 2 Jazzy has them: `definitions.msg`.
 
-A bag carries the text of every message type with those it is built from, so that a reader without ROS can decode it,
-and the type's hash (RIHS01), by which ROS knows that two ends mean the same. Types that may be a topic's have one.
+A bag carries the text of every message type and of those it is built from, so that a reader without ROS can decode it.
+It also carries the type's hash (RIHS01), by which ROS knows that both ends mean the same type. Here only the types that
+a topic may have come with a hash.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def _dependencies(name: str, found: dict[str, None]) -> None:
 def message_definition(message_type: str) -> MessageDefinition:
     """The definition of a type this project writes.
 
-    Raises `BagError` for any other; topics of those take the definition of the bag they were read from.
+    Raises `BagError` for any other type; its topics need the definition from the bag they were read from.
     """
     name = full_type_name(message_type).replace("/msg/", "/")
     known = _definitions()

@@ -1,4 +1,4 @@
-"""diagnostic_msgs/DiagnosticArray in CDR, for recording what a run had to say."""
+"""diagnostic_msgs/DiagnosticArray in CDR, for recording what a run reported."""
 
 from __future__ import annotations
 

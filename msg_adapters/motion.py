@@ -19,7 +19,7 @@ from refu_core.recordings import SUFFIXES, Axes, Recording, interpolated, n_resa
 from refu_core.skeleton import JOINT_NAMES
 
 _PAUSE_NS = NS_PER_S
-"""A step between a bag's frames that is longer is a pause, unless it is what is usual there."""
+"""A longer step between a bag's frames is a pause, unless such steps are usual in that bag."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class Motion(Recording):
         return replace(self, poses=poses.astype(np.float32), transl=transl, fps=float(fps))
 
     def in_place(self, *, up: int) -> Motion:
-        """The motion with its translations held where the first frame is, but along the axis `up`."""
+        """The motion with its translations held at the first frame's, except along the axis `up`."""
         held = np.repeat(self.transl[:1], len(self), axis=0)
         held[:, up] = self.transl[:, up]
         return replace(self, transl=held)
@@ -88,11 +88,11 @@ def read_motion(
     Args:
         path: an .npz, .npy, pickle (also joblib's and torch's) or .bvh. Nothing in a pickle is executed.
         fps: frames a second, in place of what the file says; must be given where it says nothing.
-        axes: what root orientations and translations are expressed in; `auto` sees it from the people, and says so in
-            the motion's `notes`. The motion is in SMPL's axes, but for `frame`, which leaves it as it is.
+        axes: what root orientations and translations are expressed in; `auto` infers it from how people stand, and says
+            so in the motion's `notes`. The motion is in SMPL's axes, except for `frame`, which leaves it as it is.
         person: whose motion, where the file has several; the one with most frames if not given.
-        worn: the body that will be worn (`Proportions.of_body`): betas are fitted to it where the file has only places
-            of joints, and roots turn about its pelvis. A built-in body if not given.
+        worn: the body that will be dressed (`Proportions.of_body`): betas are fitted to it where the file has only
+            joint positions, and roots turn about its pelvis. A built-in body if not given.
 
     Raises `MotionFileError` for a file that can't be read or isn't recognised, or whose arrays have other shapes.
     """
@@ -104,7 +104,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
     """The motion of a file, of a bag, or `march` for an empty path.
 
     A bag's frames are spaced evenly, without its pauses, and have the betas of the first.
-    A file's axes and rate (0 for its own) are as `read_motion` takes them. Raises `MotionFileError` and `BagError`.
+    A file's axes and rate (0 for its own) are as in `read_motion`. Raises `MotionFileError` and `BagError`.
     """
     if not path:
         return march()
@@ -119,7 +119,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
         raise BagError(msg)
     steps = np.diff([frame.stamp_ns for frame in frames])
     longest = max(_PAUSE_NS, 3 * float(np.median(np.abs(steps)))) if len(steps) else 0.0
-    kept = steps[np.abs(steps) <= longest]  # backwards, too: what is stamped anew goes on
+    kept = steps[np.abs(steps) <= longest]  # small steps back are kept, too: they are no pause
     seconds = int(kept.sum()) / NS_PER_S
     fps = len(kept) / seconds if seconds > 0 else MARCH_FPS
     notes = []

@@ -1,4 +1,4 @@
-"""Messages of people: who is in them, as frames; keypoints are followed; who is tracked, as REP-155 has it."""
+"""Messages about people: decoded to frames, with keypoints followed over time; and who is tracked (REP-155)."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _LOOKED_AT = 100
 
 
 def check_plausible(frame: SmplFrame) -> None:
-    """Finite is not enough: numbers no body has would overflow further on, where they are hard to tell apart.
+    """Raises `FrameError` for numbers that no body has.
 
-    Raises `FrameError`.
+    Being finite isn't enough: such numbers would overflow further on, where the cause is hard to tell.
     """
     for name, value, limit in (
         ("pose", frame.pose, PLAUSIBLE_ANGLE),
@@ -52,7 +52,7 @@ def check_stamp(stamp_ns: int) -> None:
 
 
 class InputStream:
-    """Messages of one input type, of parameters or of keypoints, from senders who may mean harm. Not thread-safe.
+    """Messages of one input type, of parameters or of keypoints, from untrusted senders. Not thread-safe.
 
     Raises `DecodeError` where there is no such input type.
     """
@@ -69,13 +69,13 @@ class InputStream:
     def follow(
         self, body: SmplBody, layout: str, *, betas: tuple[float, ...] | None = None, smoothing: float = 1.0
     ) -> None:
-        """Says whose keypoints come, before they do; people begin anew where that is new.
+        """Says whose keypoints will come, before they do; if anything has changed, people are followed anew.
 
         Args:
-            body: that is dressed: keypoints are of somebody with its proportions.
+            body: the one that is dressed; keypoints are taken to be of somebody with its proportions.
             layout: which points of the body come, one of `refu_core.keypoints.LAYOUTS`.
             betas: the people's shape (10,) where it is known; estimated from the lengths of bones if not given.
-            smoothing: of `TrackerSettings`.
+            smoothing: see `TrackerSettings`.
         """
         followed = body, layout, betas, smoothing
         if self.is_of_keypoints and followed != self._followed:
@@ -85,10 +85,10 @@ class InputStream:
             self._followed, self._people = followed, (people, len(points))
 
     def frames(self, data: Buffer, now_ns: int, *, sender: str = "") -> tuple[dict[str, SmplFrame], dict[str, str]]:
-        """Everybody in a message by name, and the frame that each is in: empty where the message names none.
+        """Everybody in a message by name, and the frame id of each: empty where the message names none.
 
-        The name is the sender's; of keypoints also that of the namespace, as far as there are such. What has no stamp,
-        for want of a header or with an empty one, is of now. Raises `DecodeError` for a message that can't be read, and
+        The name is the sender's; for keypoints that of the namespace, if any, is appended. A message without a stamp
+        (no header, or an empty one) counts as stamped now. Raises `DecodeError` for a message that can't be read, and
         `FrameError` for numbers that make no body.
         """
         if self._decoder is not None:
@@ -113,15 +113,15 @@ class InputStream:
         return frames, frame_ids
 
     def predicted(self, now_ns: int) -> dict[str, SmplFrame]:
-        """Everybody whose keypoints are followed, by now."""
+        """The predicted frame at `now_ns` of everybody whose keypoints are followed."""
         return {} if self._people is None else self._people[0].at(now_ns)
 
 
 class Track:
-    """What the frames of one person say of how their numbers are meant: units, stamps and axes."""
+    """Collects one person's frames to judge how their numbers are meant: units, stamps and axes."""
 
     def __init__(self) -> None:
-        self._rows = array("d")  # of each frame a few numbers: recordings are long
+        self._rows = array("d")  # only a few numbers per frame: recordings are long
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -133,9 +133,9 @@ class Track:
         self._rows.extend((longest, 1e-9 * frame.stamp_ns, *frame.pose[0], *frame.transl))
 
     def doubts(self, *, is_y_up: bool) -> dict[str, str]:
-        """What most frames are doubted for: a sentence by `angles`, `pace`, `stamps` or `axes`, which are said once.
+        """What is doubtful in most frames: a sentence for each of `angles`, `pace`, `stamps` and `axes` that is.
 
-        `is_y_up`: they are said to be in SMPL's axes.
+        `is_y_up`: the frames are said to be in SMPL's axes.
         """
         rows = np.frombuffer(self._rows).reshape(-1, _NUMBERS)
         if not len(rows):
@@ -167,22 +167,22 @@ class Track:
 
 _NUMBERS = 8
 _SHORTEST_S, _LONGEST_S = 1e-3, 5.0
-"""Frames are no nearer to each other, and no farther apart, by stamps that are in nanoseconds [s]."""
+"""The shortest and longest plausible step between frames whose stamps are in nanoseconds [s]."""
 
 
 class Doubts:
-    """What is to be said of frames that come, each thing once."""
+    """Warnings about frames that come, each given once."""
 
     def __init__(self) -> None:
         self.has_foreign_betas = False
-        """Whether betas have come of which nobody knew what they are of."""
+        """Whether betas have come without anything saying whose shape space they belong to."""
         self.of_senders: dict[str, str] = {}
-        """What is doubted of the newest frames of each sender: units and stamps. Who lies may be ill."""
+        """Doubts about each sender's newest frames: units and stamps, but not axes; a person lying down may be ill."""
         self._tracks: dict[str, Track] = {}
         self._said: set[str] = set()
 
     def of(self, sender: str, frame: SmplFrame, options: DressOptions, *, is_y_up: bool) -> list[str]:
-        """What is to be said now of a sender's frame of parameters; `is_y_up`: it is said to be in SMPL's axes."""
+        """New warnings about a sender's frame of parameters; `is_y_up`: it is said to be in SMPL's axes."""
         found = {}
         if not options.betas_are_told and frame.betas.any():
             self.has_foreign_betas = True
@@ -200,7 +200,7 @@ class Doubts:
         return new
 
     def forget(self, sender: str) -> None:
-        """A sender has left: people come and go for days."""
+        """Forgets a sender who has left: people come and go for days."""
         self._tracks.pop(sender, None)
         self.of_senders.pop(sender, None)
 

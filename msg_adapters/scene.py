@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from refu_core.outputs import PinholeCamera
 
 _MOST_WAITING = 2
-"""Frames of a person. With one, 171 of 900 frames at 30 Hz were lost where one takes 30 ms, with two none."""
+"""Waiting frames of a person. With one, 171 of 900 frames at 30 Hz were lost where each takes 30 ms; with two, none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,17 +31,17 @@ class Arrival:
     placement: Placement = field(default_factory=Placement)
     """From the sender's frame to that of the messages."""
     camera: PinholeCamera | None = None
-    """Who looks, in the frame of the messages."""
+    """The camera that sees the person, in the frame of the messages."""
 
 
 class Scene:
     """The newest frames of each person: the one to work on next, and the one that came meanwhile.
 
-    A frame that takes a little too long costs no other one so, as long as the next ones make up for it. Whoever is two
-    frames late doesn't: then all that wait are left out but the newest, so that nobody stays behind.
+    So a frame that takes a little too long costs no other one, as long as the next ones make up for it. When two are
+    waiting and another one comes, only the newest is kept, so that nobody stays behind.
 
-    Thread-safe. Frames that are left out are counted: as `max_rate` while the rate limit held them back, otherwise as
-    `stale`. So is that of a person for whom there is no room beside `most` others: as `crowd`.
+    Thread-safe. Frames that are left out are counted: as `max_rate` while the rate limit holds them back, as `crowd`
+    if there is no room for the person beside `most` others, otherwise as `stale`.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Scene:
     def put(
         self, person: str, frame: SmplFrame, placement: Placement | None = None, camera: PinholeCamera | None = None
     ) -> None:
-        """A person's new frame, where the sender's frame is (the messages' own if not given), and who looks."""
+        """Adds a person's frame, with the sender's placement (the messages' own frame if not given) and the camera."""
         now = self._clock()
         with self._changed:
             if person not in self._seen and len(self._seen) >= self._most:
@@ -77,7 +77,7 @@ class Scene:
             self._changed.notify()
 
     def take(self, *, not_before: float = 0.0, timeout: float = 0.1) -> dict[str, Arrival]:
-        """All persons' next frames, as soon as there is one, but not before a time; nothing after `timeout` [s]."""
+        """Everybody's next frame, as soon as there is one, but not before `not_before`; empty after `timeout` [s]."""
         deadline = self._clock() + timeout
         with self._changed:
             while not self._closed:
@@ -106,7 +106,7 @@ class Scene:
                 self._statistics.drop("stale")
 
     def leave(self, timeout: float) -> list[str]:
-        """Those who haven't sent for `timeout` [s]; each is named once."""
+        """Removes those who haven't sent for `timeout` [s], and returns their names."""
         with self._changed:
             horizon = self._clock() - timeout
             gone = [person for person, seen in self._seen.items() if seen < horizon and person not in self._pending]
@@ -116,7 +116,7 @@ class Scene:
 
     @property
     def persons(self) -> tuple[str, ...]:
-        """Those who are here."""
+        """The people who are here."""
         with self._changed:
             return tuple(self._seen)
 

@@ -12,7 +12,7 @@ import numpy as np
 from refu_core.errors import printable
 
 _WINDOW = 1000
-"""Latencies that percentiles are taken of."""
+"""How many of the newest latencies the percentiles are taken of."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,10 +26,10 @@ class Report:
     latency_ms: tuple[float, float, float]
     """p50, p95, p99 of the last frames, from receipt to publish."""
     largest_shift: float
-    """How far the collider left the skin at most, since the last report [m]."""
+    """How far the collider moved the skin at most, since the last report [m]."""
     last_error: str
     silent_for: float | None
-    """Since the last input of anybody [s]; None if there was none."""
+    """Time since the last input of anybody [s]; None if there was none."""
     reasons: defaultdict[str, str]
     """The newest reason for each kind of drop, and for a fault; empty where there is none."""
 
@@ -46,7 +46,7 @@ class Statistics:
     """Counters that any thread may raise.
 
     Keys: received, ticks, frames, drop.<cause>, skip.<kind> (work that nobody needed), fault.<where>,
-    penetration.<found|unresolved>, back_in_time (a frame older than its person's frame before), late_transform (a frame
+    penetration.<found|unresolved>, back_in_time (a frame older than its person's previous one), late_transform (a frame
     placed by a transform older than itself), beyond_promise (a frame that "nothing inside" isn't promised for).
     """
 
@@ -62,21 +62,21 @@ class Statistics:
         self._error = ""
 
     def count(self, key: str) -> None:
-        """One more of what a key stands for."""
+        """Counts one more for a key."""
         with self._lock:
             self._total[key] += 1
 
     def receive(self) -> None:
-        """A message came, whatever it holds."""
+        """Counts a message that came, whatever it holds."""
         self._received_at = time.monotonic()
         self.count("received")
 
     def drop(self, cause: str, reason: str = "") -> None:
-        """A frame was lost to something that isn't wanted."""
+        """Counts a frame that was lost, with the reason."""
         self._because(f"drop.{cause}", cause, reason)
 
     def fault(self, where: str, reason: str) -> None:
-        """A callback failed, or a request made no sense."""
+        """Counts a callback that failed, or a request that made no sense."""
         self._because(f"fault.{where}", "fault", reason)
 
     def _because(self, key: str, kind: str, reason: str) -> None:
@@ -85,12 +85,12 @@ class Statistics:
             self._reasons[kind] = printable(reason) or self._reasons[kind]
 
     def shift(self, largest: float) -> None:
-        """In a frame the collider left the skin by so much [m]."""
+        """Notes how far the collider moved the skin in a frame [m]."""
         with self._lock:
             self._largest_shift = max(self._largest_shift, largest)
 
     def publish(self, latencies_ms: list[float], *, found: int, unresolved: int) -> None:
-        """A message went out with the frames of so many persons."""
+        """Counts a message that went out, with one latency for each person in it."""
         counts = {"ticks": 1, "frames": len(latencies_ms)}
         counts |= {"penetration.found": found, "penetration.unresolved": unresolved}
         with self._lock:
@@ -98,11 +98,11 @@ class Statistics:
             self._latencies.extend(latencies_ms)
 
     def set_error(self, text: str) -> None:
-        """What keeps the node from doing as it was asked, or empty."""
+        """Notes what keeps the node from doing as it was asked, or empty."""
         self._error = printable(text)
 
     def report(self) -> Report:
-        """What there is to say, once a second."""
+        """The report on the time since the last one; to be called once a second."""
         with self._lock:
             now, total = time.monotonic(), self._total.copy()
             p50, p95, p99 = np.percentile(self._latencies or (0.0,), (50, 95, 99)).tolist()

@@ -1,4 +1,4 @@
-"""tf2_msgs/TFMessage in CDR, and a buffer of transforms that is asked where a frame was at a time."""
+"""tf2_msgs/TFMessage in CDR, and a buffer of transforms that tells where a frame was at a given time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from refu_core.frames import PLAUSIBLE_TRANSL
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 HISTORY_NS = 10 * 10**9
-"""How far back transforms are kept, as tf2 does [ns]."""
+"""How far back transforms are kept, as in tf2 [ns]."""
 _MOST_FRAMES = _MOST_STAMPS = 10_000
-"""Of all, and of one in the time that is kept: stamps are the sender's."""
+"""The most frames in all, and the most stamps of one frame within the history: both are up to the sender."""
 _LONGEST_WAY = 100
-"""Frames above one another. Robots have a few dozen; the way is gone anew for each input."""
+"""Longest chain of parents. Robots have a few dozen; the chain is followed anew for each input."""
 _UNIT_TOLERANCE = 1e-2
-"""A quaternion's length is no farther from 1, as tf2 wants it."""
+"""How far a quaternion's length may be from 1, as in tf2."""
 _MIN_TRANSFORM_BYTES = 72
 
 
@@ -74,28 +74,28 @@ def decode_transforms(data: Buffer) -> list[Transform]:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Points of one frame in another: p ↦ `rotation` p + `translation`."""
+    """Takes points of one frame to another: p ↦ `rotation` p + `translation`."""
 
     rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     """Shape (3, 3)."""
     translation: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """[m], shape (3,)."""
     is_late: bool = False
-    """Whether the newest transform there was is older than what was asked for."""
+    """Whether the newest transform was older than the time asked for."""
 
     def after(self, inner: Placement) -> Placement:
-        """First `inner`, then this."""
+        """The placement that applies first `inner`, then this."""
         translation = self.rotation @ inner.translation + self.translation
         return Placement(self.rotation @ inner.rotation, translation, self.is_late or inner.is_late)
 
     def inverse(self) -> Placement:
-        """The way back."""
+        """The inverse placement."""
         return Placement(self.rotation.T, -(self.rotation.T @ self.translation), self.is_late)
 
 
 @dataclass(eq=False)
 class _Track:
-    """What is known of one child frame, the oldest first: what came last, and of what came before it what is older."""
+    """Transforms of one child frame, oldest first: the one that came last, and those with older stamps before it."""
 
     parent: str
     is_static: bool
@@ -104,7 +104,7 @@ class _Track:
     """Translation and quaternion, shape (7,) each."""
 
     def put(self, stamp_ns: int, value: NDArray[np.float64]) -> None:
-        # Whoever says where a frame was says what comes after it anew: a simulation was reset, a bag begins again.
+        # A transform with an older stamp replaces all later ones: a simulation was reset, or a bag begins again.
         at = 0 if self.is_static else bisect_left(self.stamps, stamp_ns)
         del self.stamps[at:], self.values[at:]
         self.stamps.append(stamp_ns)
@@ -113,7 +113,7 @@ class _Track:
         del self.stamps[:old], self.values[:old]
 
     def at(self, stamp_ns: int, tolerance_ns: int, child: str) -> Placement:
-        """Between the two transforms around that time. Raises `TransformError`."""
+        """The placement at that time, between the two transforms around it. Raises `TransformError`."""
         after, is_late = bisect_right(self.stamps, stamp_ns), False
         if self.is_static or self.stamps[after - 1 if after else 0] == stamp_ns:
             value = self.values[max(after - 1, 0)]
@@ -141,14 +141,14 @@ def _between(values: Sequence[NDArray[np.float64]], stamps: Sequence[int], stamp
 class TransformBuffer:
     """The transforms of `/tf` and `/tf_static` of the last ten seconds. Not thread-safe.
 
-    A frame of `/tf` that no transform has come of for `HISTORY_NS` of the `clock` [s] is forgotten.
+    A frame of `/tf` is forgotten when no transform of it has come for `HISTORY_NS` by the `clock` [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._tracks: dict[str, _Track] = {}
         self._clock, self._forget_at = clock, 0.0
         self._heard: set[str] = set()
-        """Frames that came since some were forgotten."""
+        """Frames that were heard of since others were last forgotten."""
 
     def __len__(self) -> int:
         """How many frames have a parent."""
@@ -156,7 +156,7 @@ class TransformBuffer:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further frame is taken."""
+        """Whether no further frame is accepted."""
         return len(self) >= _MOST_FRAMES
 
     def put(self, data: Buffer, *, is_static: bool) -> int:
@@ -189,7 +189,7 @@ class TransformBuffer:
     def lookup(self, target: str, source: str, stamp_ns: int, *, tolerance_ns: int = 0) -> Placement:
         """Where points of `source` were in `target` at that time.
 
-        A transform that isn't there yet is replaced by the newest, as long as that is no older than the tolerance.
+        If that time's transform hasn't come yet, the newest is used, unless it is older by more than the tolerance.
 
         Raises:
             TransformError: no way leads from one to the other, or not at that time.
@@ -208,7 +208,7 @@ class TransformBuffer:
         return ends[1].inverse().after(ends[0])
 
     def _way(self, frame: str) -> list[str]:
-        """The frame and what is above it, up to a root or, where they form a ring, once around."""
+        """The frame and its ancestors, up to a root or, if they form a ring, once around it."""
         way = [frame]
         while len(way) <= _LONGEST_WAY and (track := self._tracks.get(way[-1])) is not None and track.parent not in way:
             way.append(track.parent)

@@ -1,12 +1,11 @@
 """Garments on SMPL bodies in real time, free of body-garment collisions.
 
-Start with `GarmentPipeline.load(["tshirt-male"])` and call it with a `SmplFrame`. The parts can be used alone, each
-from the package it is in: `keypoints` and `recordings` (what comes in), `body`, `garments`, `backbones`, `sdf`, `refu`
-(the paper's layer), `contact` (what brings a garment off the body), `realtime`, `outputs` (what robots ask of dressed
-people), `observation` (fitting to a camera's points), `metrics`, `simulation`, `training`. The names most often needed
-are here, too.
+Start with `GarmentPipeline.load(["tshirt-male"])` and call it with a `SmplFrame`. Each part can also be used alone,
+from its own package: `keypoints` and `recordings` (the input), `body`, `garments`, `backbones`, `sdf`, `refu` (the
+paper's layer), `contact` (brings a garment off the body), `realtime`, `outputs` (what robots ask about dressed people),
+`observation` (fitting to a camera's points), `metrics`, `simulation`, `training`. The most used names are here, too.
 
-Most names are imported when they are first used: code that needs `SmplFrame` alone doesn't wait for torch and warp.
+Most names are imported on first use, so that code that only needs `SmplFrame` doesn't wait for torch and warp.
 """
 
 from __future__ import annotations

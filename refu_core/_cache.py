@@ -1,4 +1,4 @@
-"""What takes seconds to compute is kept in a folder of the user's, and computed again wherever it can't be."""
+"""Keeps what takes seconds to compute in a folder of the user's; where that fails, it is computed again."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from refu_core.errors import RefuError
 
 
 def cache_folder() -> Path:
-    """`REFU_CACHE`, or `refu` in the user's folder for such files (`XDG_CACHE_HOME`, ~/.cache); it needs not exist."""
+    """`REFU_CACHE`, or `refu` in the user's cache folder (`XDG_CACHE_HOME`, ~/.cache); it need not exist yet."""
     chosen = os.environ.get("REFU_CACHE")
     if chosen:
         return Path(chosen)
@@ -32,7 +32,7 @@ def cache_folder() -> Path:
 
 
 def recall(name: str, *, keys: Collection[str]) -> dict[str, NDArray[Any]] | None:
-    """The arrays that were kept as `name`; None where there are none, or not all of `keys`."""
+    """The arrays that were kept as `name`; None if there are none, or not all of `keys`."""
     path = cache_folder() / f"{name}.npz"
     try:
         found = read_npz(path, keys=keys, error=RefuError, wanted="what was kept")
@@ -42,7 +42,7 @@ def recall(name: str, *, keys: Collection[str]) -> dict[str, NDArray[Any]] | Non
 
 
 def keep(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Keeps arrays as `name`, whole or not at all; nothing is said where there is no room for them."""
+    """Keeps arrays as `name`, all of them or none; silent if they can't be written."""
     with contextlib.suppress(OSError):
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,7 @@ def keep(name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 @cache
 def code_hash(*patterns: str) -> str:
-    """Of the names and content of the project's files that match: other code or weights would make something else."""
+    """Hash of the names and content of the project's matching files: other code or weights give other results."""
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for file in sorted({file for pattern in patterns for file in root.glob(pattern) if file.is_file()}):

@@ -1,4 +1,4 @@
-"""Devices: names, checked where they come in; threads; signs that one is lost."""
+"""Devices: checks of their names, torch's threads and settings, and signs that a device is lost."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import torch
 from refu_core.errors import RefuError
 
 _LOSSES = ("CUDA error", "Warp CUDA error", "HIP error", "cudaError")
-"""What torch and warp begin with when they report the driver's errors, which have no common class in all versions."""
+"""Signs of a driver's error in messages of torch and warp: not in all versions do these errors have a common class."""
 
 
 def checked_device(name: str | torch.device) -> torch.device:
-    """The torch device of a name. Raises `RefuError` for one that there isn't."""
+    """The torch device of this name. Raises `RefuError` if there is no such device."""
     try:
         device = torch.device(name)
     except (RuntimeError, ValueError, TypeError) as error:
@@ -29,12 +29,12 @@ def checked_device(name: str | torch.device) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         msg = f"no device {name!r}: the last one is cuda:{torch.cuda.device_count() - 1}"
         raise RefuError(msg)
-    return torch.device("cpu") if device.type == "cpu" else device  # of processors there is one, whatever its number
+    return torch.device("cpu") if device.type == "cpu" else device  # there is only one CPU device, whatever its index
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Torch on one thread, as the node runs: a frame is too little work to share, and others want their cores."""
+    """Runs torch on one thread, as the node does: a frame is too little work to share, and others need the cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -45,8 +45,10 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Torch as this project takes it, whatever the caller has set: inference mode, autocast, a default device, and
-    derivatives, of which there are none."""
+    """Torch with this project's own settings, whatever the caller has set.
+
+    There is no inference mode, no autocast and no gradient, and the default device is the CPU.
+    """
     with ExitStack() as settings:
         settings.enter_context(torch.inference_mode(False))
         settings.enter_context(torch.no_grad())
@@ -59,9 +61,9 @@ def own_settings() -> Iterator[None]:
 
 
 def is_device_loss(error: BaseException) -> bool:
-    """Whether an error of torch or warp says that the device itself has failed: nothing more can be computed on it.
+    """Whether an error of torch or warp says that the device itself has failed, so that it can't compute any more.
 
-    That it has no memory left isn't such an error; the next frame may find some.
+    Running out of memory isn't such an error; the next frame may find some.
     """
     if isinstance(error, torch.OutOfMemoryError):
         return False

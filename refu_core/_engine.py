@@ -1,4 +1,4 @@
-"""What spreads independent tasks over processes; the core has the one that doesn't, `refu_lab.fleet` one that does."""
+"""Engines for independent tasks: the one here runs them in this process, that of `refu_lab.fleet` in several."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Lost:
-    """In the place of a task's result: what became of the processes that tried it."""
+    """Takes the place of a task's result: says what became of the processes that tried it."""
 
     reason: str
 
 
 class Engine(Protocol):
-    """Runs tasks, each a function of its own content: done again, or elsewhere, it gives the same."""
+    """Runs tasks that depend on nothing but their content: run again, or elsewhere, a task gives the same result."""
 
     def run(
         self, make: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task]
     ) -> Iterator[tuple[int, Result | Lost]]:
-        """Yields each task's number and result as they come, each once.
+        """Yields each task's number and result once, in the order in which they come.
 
-        `make` makes a process's function, once for all its tasks; it is sent to each process, as tasks and results are.
-        A task is asked for when its time has come. Raises what a task raises; `RefuError` without processes in reach.
+        `make` is sent to each process, as tasks and results are, and makes the function for all of its tasks. A task is
+        taken from `tasks` only when its turn comes. Raises what a task raises; `RefuError` if no process is in reach.
         """
 
 

@@ -1,8 +1,8 @@
 """Warp's cache of compiled kernels, checked before it is used: what a crash has cut short is built again.
 
 Warp loads whatever lies in its cache. An object that a power cut, a full disk or a copy has damaged fails at every
-start, or ends the process. So checksums lie beside the files of each module, written once it has been loaded; files
-that don't agree with them are thrown away unread.
+start, or ends the process. So checksums are kept beside the files of each module, written once it has been loaded;
+files that don't match them are thrown away unread.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from refu_core.errors import RefuError
 
 _SUMS = "refu-checksums.json"
 _PATIENCE = 600.0
-"""How long another process is waited for that compiles [s]; a first start ever takes ten."""
+"""How long to wait for another process that is compiling [s]; the very first start takes ten."""
 _lock = threading.RLock()
 _loaded: set[tuple[str, str, int | None]] = set()
 
 
 def no_cache(reason: OSError) -> RefuError:
-    """What to say where compiled kernels can't be kept."""
+    """The error to raise where compiled kernels can't be kept."""
     folder = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH") or "Warp's cache"
     msg = (
         f"compiled kernels can't be kept in {folder}: {reason}; make room there and make it writable, "
@@ -42,7 +42,7 @@ def no_cache(reason: OSError) -> RefuError:
 
 
 def guard() -> None:
-    """Has Warp load this project's kernels by `_load` from now on; those of others are loaded as ever."""
+    """Makes Warp load this project's kernels through `_load` from now on; other kernels are loaded as before."""
     module = type(wp.get_module(__name__))
     plain = module.load
 
@@ -51,7 +51,7 @@ def guard() -> None:
         key = (self.name, str(device), block_dim)
         if key in _loaded or not self.name.startswith("refu_core."):
             return plain(self, device, block_dim, *args, **kwargs)
-        with _lock:  # of two threads that load one module, one would unload the other's
+        with _lock:  # of two threads loading a module, one would unload the other's
             loaded = _load(self, block_dim, lambda: plain(self, device, block_dim, *args, **kwargs))
             _loaded.add(key)
         return loaded
@@ -60,10 +60,10 @@ def guard() -> None:
 
 
 def _load(module: Any, block_dim: int | None, plain: Callable[[], Any]) -> Any:
-    """Loads a module from files that are as they were built, or builds them anew.
+    """Loads a module from its compiled files if they are intact, or else builds them anew.
 
     Raises:
-        RefuError: there is no place for them, or new ones can't be loaded either.
+        RefuError: there is no place for the files, or new ones can't be loaded either.
     """
     cache = Path(wp.config.kernel_cache_dir)
     folder = cache / f"wp_{module.name}_{module.get_module_hash(block_dim).hex()[:7]}"
@@ -87,7 +87,7 @@ def _load(module: Any, block_dim: int | None, plain: Callable[[], Any]) -> Any:
 
 
 def _build(module: Any, folder: Path, plain: Callable[[], Any]) -> Any:
-    module.mark_modified()  # Warp forgets that it has failed
+    module.mark_modified()  # makes Warp forget that it has failed
     try:
         loaded = plain()
     except OSError:
@@ -97,7 +97,7 @@ def _build(module: Any, folder: Path, plain: Callable[[], Any]) -> Any:
             raise
         msg = f"the kernels of {module.name} can't be built ({error}): delete {folder} and try again"
         raise RefuError(msg) from error
-    with contextlib.suppress(OSError):  # they are loaded; without checksums the next start builds them again
+    with contextlib.suppress(OSError):  # the kernels are loaded; without checksums the next start builds them again
         part = folder / f"{_SUMS}.part"
         part.write_text(json.dumps(_sums(folder)))
         part.replace(folder / _SUMS)

@@ -23,18 +23,18 @@ from refu_core._files import open_file
 from refu_core.errors import RefuError
 
 MAX_BYTES = 256 << 20
-"""All arrays that are taken from a file together, as float64: a body of 45,000 vertices, an hour of motion at 120 Hz
-(half an hour with the hands of SMPL-X). What would be more is refused before any of it is unpacked."""
+"""The most that all arrays taken from a file may need together, as float64: a body of 45,000 vertices, an hour of
+motion at 120 Hz (half an hour with the hands of SMPL-X). Anything larger is refused before any of it is unpacked."""
 _MAX_FILE_BYTES = 1 << 32
-"""Of which only the directory and the arrays that are wanted are read."""
+"""Only the directory and the wanted arrays of such a file are read."""
 _MAX_READ = 1 << 20
-"""A directory of more is cut off there, and so refused; the arrays are read in smaller steps."""
+"""A larger directory is cut off there, and so refused; the arrays are read in smaller steps."""
 MAX_TEXT_BYTES = 1 << 15
-"""Names of a skeleton's joints take a quarter of it."""
+"""The names of a skeleton's joints take a quarter of this."""
 _MAX_AXES = 32
 _MAX_HEADER_BYTES = 1 << 14
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""What numpy writes; other methods ask for gigabytes of their own."""
+"""The compression methods that numpy writes; others may allocate gigabytes themselves."""
 DAMAGE = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError, MemoryError, OverflowError),
     *(EOFError, struct.error, TokenError, SyntaxError, NotImplementedError, RuntimeError),
@@ -44,22 +44,22 @@ DAMAGE = (
 
 
 def told(cause: BaseException) -> str:
-    """What damage an error tells of."""
+    """What an error says about the damage."""
     return str(cause) or ("it is cut short" if isinstance(cause, EOFError) else type(cause).__name__)
 
 
 class ArrayBudget:
-    """The numbers that may still be taken from a file."""
+    """How many numbers may still be taken from a file."""
 
     def __init__(self) -> None:
         self._left = MAX_BYTES // 8
 
     def take(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        """Raises `ValueError` where an array is too much, has no size, or isn't of plain numbers or words of text."""
+        """Raises `ValueError` if an array is too large, has too many axes, or isn't of plain numbers or text."""
         if len(shape) > _MAX_AXES:
             msg = f"an array of {len(shape)} axes"
             raise ValueError(msg)
-        # An axis of length 0 makes no array small: code loops over the others.
+        # An axis of length 0 doesn't make an array small: code loops over the other axes.
         count = math.prod(max(n, 1) for n in shape)
         is_text = dtype.kind in "US"
         if is_text and count * max(dtype.itemsize, 1) > MAX_TEXT_BYTES:
@@ -75,10 +75,10 @@ class ArrayBudget:
 
 
 def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` whose names are in `keys` (those that are there): numbers, or words of text.
+    """The arrays of an `.npz` that are named in `keys`, as far as it has them: numbers or text.
 
     Raises:
-        error: the file can't be read, holds anything else under one of the keys, or more than `MAX_BYTES`.
+        error: the file can't be read, holds anything else under one of the keys, or holds more than `MAX_BYTES`.
     """
     with _archive(path, error, wanted) as archive:
         names = {entry: entry.filename.removesuffix(".npy") for entry in archive.infolist()}
@@ -97,7 +97,7 @@ def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wante
 
 
 def npz_names(path: Path, *, error: type[RefuError], wanted: str) -> list[str]:
-    """The names of what an archive holds. Raises `error` as `read_npz`."""
+    """The names of the arrays in an archive. Raises `error` as `read_npz` does."""
     with _archive(path, error, wanted) as archive:
         return [name.removesuffix(".npy") for name in archive.namelist()]
 
@@ -115,14 +115,14 @@ def _archive(path: Path, error: type[RefuError], wanted: str) -> Iterator[zipfil
 
 
 def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Checks that a file of `size` bytes, read from its start on, holds the array that its header announces.
+    """Checks that a file of `size` bytes, read from its start, holds the array that its header announces.
 
-    Numpy makes room for what a header says before it looks for it, and lengthens a file that it maps to write.
+    Numpy allocates what a header announces before it looks for it, and lengthens a file that it maps for writing.
 
     Returns:
         The array's shape and type.
 
-    Raises `ValueError`, and what else numpy raises on damaged headers.
+    Raises `ValueError`, and whatever else numpy raises on damaged headers.
     """
     head = io.BytesIO(file.read(_MAX_HEADER_BYTES))
     version = npy.read_magic(head)

@@ -1,4 +1,4 @@
-"""Arrays of pickles: what the unpickler has read, rebuilt within the budget of all files."""
+"""Arrays from pickles: rebuilt from what the unpickler has read, within the budget that applies to all files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from refu_core.errors import RefuError
 
 
 class PickledArrays:
-    """Makes arrays of records; `storage` gives the bytes that torch keeps beside its pickle, by their key."""
+    """Makes arrays from records; `storage` returns the bytes that torch keeps beside its pickle, by their key."""
 
     def __init__(self, storage: Callable[[str], bytes] | None = None) -> None:
         self._budget = ArrayBudget()
@@ -39,7 +39,7 @@ class PickledArrays:
 
     def of(self, value: Any) -> NDArray[Any]:
         """The array that a value of a pickle stands for. Raises `ValueError`, `KeyError`, `TypeError`."""
-        for _ in range(8):  # variables of variables; one that is its own value never ends
+        for _ in range(8):  # variables may hold variables; one that holds itself would never end
             if not isinstance(value, Record) or value.kind != "chumpy":
                 break
             if type(value.state) is not dict or "x" not in value.state:
@@ -85,7 +85,7 @@ class PickledArrays:
         """A tensor of torch: a view of a storage."""
         storage, offset, shape, strides = record.args[:4]
         given = self._storage
-        if exactly(Record, storage).kind == "stream":  # a pickle of tensors that torch knows nothing of
+        if exactly(Record, storage).kind == "stream":  # tensors in a pickle that torch didn't write
             storage, given = _streamed(storage)
         _, name, key = exactly(Record, storage).args[:3]
         kind = exactly(Name, name).kind
@@ -124,7 +124,7 @@ class PickledArrays:
 
 
 def _streamed(record: Record) -> tuple[Record, Callable[[str], bytes]]:
-    """A storage that torch has written as a stream of its own, and what gives its bytes."""
+    """A storage that torch has written as a stream of its own, and the function that returns its bytes."""
     file = io.BytesIO(bytes_of(record.args[0] if record.args else None))
     if Unpickler(file).load() != STREAM_MAGIC:
         msg = "a tensor whose numbers are no stream of torch"
@@ -136,7 +136,7 @@ def _streamed(record: Record) -> tuple[Record, Callable[[str], bytes]]:
 def read_smpl_pickle(
     path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str
 ) -> dict[str, NDArray[Any]]:
-    """The arrays of an official SMPL `.pkl` whose names are in `keys`.
+    """The arrays of an official SMPL `.pkl` that are named in `keys`.
 
     Raises:
         error: the file is too large, isn't a pickle, isn't a model, or refers to anything but arrays.

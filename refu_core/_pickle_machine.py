@@ -1,9 +1,9 @@
 """Reads pickles as data: official SMPL `.pkl` files, and what pose estimators write with pickle, joblib or torch.
 
-The standard library's unpickler (the one in Python) keeps the stack. Here every name becomes an inert record of what an
-object was built from, so nothing is imported or called. Opcodes that would hash any value, make room for what they only
-announce, or know Python's registries are replaced or refused. Arrays are made of the records afterwards (`_pickle`),
-within the budget of all files.
+The standard library's unpickler (its version in Python) manages the stack. Here every name becomes an inert record of
+what an object was built from, so nothing is imported or called. Opcodes that would hash arbitrary values, allocate what
+they only announce, or use Python's registries are replaced or refused. Arrays are made from the records afterwards
+(`_pickle`), within the budget that applies to all files.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from numpy.typing import NDArray
 MAX_PICKLE_BYTES = 512 << 20
 """The largest official file has 236 MiB: it's text, and takes three times what its arrays do."""
 STREAM_MAGIC = 0x1950A86A20F9469CFC6C
-"""What a stream of torch begins with: a pickle of this number alone."""
+"""A stream of torch begins with a pickle of this number alone."""
 _MODEL_READS, _DATA_READS = 200_000, 1_500_000
-"""An opcode takes one to three. An official file has some hundred opcodes; a tracker's has a thousand a frame."""
+"""The most reads of a model and of data. An opcode takes one to three; an official file has some hundred opcodes, a
+tracker's has a thousand a frame."""
 _MAX_MARKS = 10_000
-"""Values in values; Python itself writes no more than a thousand."""
+"""The most values nested in each other; Python itself writes no more than a thousand."""
 _MAX_NAMES = 10_000
 """Python writes each name once in a file, and then refers to it."""
 _MAX_NESTED = 4
-"""Pickles in a pickle: joblib writes arrays of objects so."""
+"""The most pickles nested in each other: joblib writes arrays of objects that way."""
 _LONG_TEXT = 1 << 16
 _NUMPY = ("numpy.core", "numpy._core")
 MODEL_NAMES: dict[str, str] = {
@@ -45,7 +46,7 @@ MODEL_NAMES: dict[str, str] = {
     **{f"{module}.csc_matrix": "sparse" for module in ("scipy.sparse.csc", "scipy.sparse._csc", "scipy.sparse")},
     **{f"chumpy.{name}": "chumpy" for name in ("ch.Ch", "ch.MatVecMult", "reordering.Select")},
 }
-"""What a model may name, and what it is here."""
+"""The names that a model may contain, and the kind of record that each becomes here."""
 _DATA_NAMES: dict[str, str] = MODEL_NAMES | {
     **{f"{package}.multiarray.scalar": "scalar" for package in _NUMPY},
     **{f"collections.{name}": "mapping" for name in ("OrderedDict", "defaultdict")},
@@ -61,12 +62,12 @@ _DATA_NAMES: dict[str, str] = MODEL_NAMES | {
         )
     },
 }
-"""What a file of data may name, besides; everything else that it names stands there inert (`foreign`)."""
+"""The names that a file of data may use; every other name in it is kept, but inert (`foreign`)."""
 
 
 @dataclass(eq=False, slots=True)
 class Name:
-    """A name of the table, or `foreign`."""
+    """A name, by its kind in the tables above, or `foreign`."""
 
     kind: str
 
@@ -79,10 +80,10 @@ class Record:
     args: tuple[Any, ...] = ()
     state: Any = None
     items: dict[str | int, Any] = field(default_factory=dict)
-    """What was put into it, where it is some class's kind of dictionary."""
+    """What was put into it, if it stands for a subclass of dictionary."""
 
     def extend(self, _: Any) -> None:
-        """What is put into some class's kind of list isn't kept."""
+        """Drops what is put into it, if it stands for a subclass of list."""
 
     append = extend
 
@@ -100,7 +101,7 @@ class _Opcodes(dict[int, Any]):
 
 
 class Unpickler(pickle._Unpickler):
-    """Of a model it takes no names but those that a model needs; of data it takes any and lets foreign objects lie.
+    """In a model it accepts only the names that a model needs; in data it accepts any, and foreign objects stay inert.
 
     `load` raises one of `DAMAGE` where the file is damaged.
     """
@@ -118,7 +119,7 @@ class Unpickler(pickle._Unpickler):
         self._left, self._n_names = _MODEL_READS if is_model else _DATA_READS, 0
         self._read_uncounted, self._file_read = file.read, self._read_counted
         self.storages: dict[str, np.dtype[Any]] = {}
-        """The types of the storages beside the pickle by their keys: torch's."""
+        """The types of torch's storages beside the pickle, by their keys."""
 
     def _read_counted(self, n: int) -> bytes:
         self._left -= 1
@@ -128,7 +129,7 @@ class Unpickler(pickle._Unpickler):
         return self._read_uncounted(n)
 
     def find_class(self, module: str, name: str) -> Name:
-        """Stands for what a pickle names."""
+        """A stand-in for what a pickle names."""
         self._n_names += 1
         if self._n_names > _MAX_NAMES:
             msg = f"it names objects more than {_MAX_NAMES} times"
@@ -140,7 +141,7 @@ class Unpickler(pickle._Unpickler):
         return Name(_DATA_NAMES.get(full, "foreign"))
 
     def persistent_load(self, pid: Any) -> Record:
-        """Stands for a storage of torch, which is beside the pickle."""
+        """A stand-in for a storage of torch, which is beside the pickle."""
         storage = Record("storage", exactly(tuple, pid))
         if len(pid) > 2 and type(pid[1]) is Name and type(pid[2]) is str and is_plain(pid[1].kind):
             self.storages[pid[2]] = np.dtype(f"<{pid[1].kind}")
@@ -162,7 +163,7 @@ class Unpickler(pickle._Unpickler):
 
     def _build(self) -> None:
         state, built = self.stack.pop(), self.stack[-1]
-        if type(built) is dict:  # what else some class's kind of dictionary knows
+        if type(built) is dict:  # further attributes of a subclass of dictionary
             return
         exactly(Record, built).state = state
         if built.kind == "joblib":
@@ -184,7 +185,7 @@ class Unpickler(pickle._Unpickler):
     def _text(self, length: str) -> None:
         (n,) = struct.unpack(length, self.read(struct.calcsize(length)))
         text = self.read(n)
-        # Long text is bytes that Python 3 wrote as text; one other character would make each four times as wide.
+        # Long text is bytes that Python 3 wrote as text; one wider character makes all up to four times as wide.
         if len(text) > _LONG_TEXT and text.translate(None, bytes(range(0xC4))):
             msg = "a long text that isn't of bytes"
             raise ValueError(msg)
@@ -235,8 +236,10 @@ class Unpickler(pickle._Unpickler):
 
 
 def read_stream(file: BinaryIO) -> tuple[Any, Callable[[str], bytes]]:
-    """What torch wrote before its files were archives, and what gives a storage's bytes by its key: `STREAM_MAGIC`,
-    which has been read, then more pickles, then numbers."""
+    """The content of a torch file from before those were archives, and a function that gives a storage's bytes by key.
+
+    Such a file holds `STREAM_MAGIC`, which has been read already, then more pickles, then numbers.
+    """
     for _ in ("version", "machine"):
         Unpickler(file).load()
     unpickler = Unpickler(file)
@@ -254,7 +257,7 @@ def read_stream(file: BinaryIO) -> tuple[Any, Callable[[str], bytes]]:
 
 
 def exactly(kind: type[Any], value: Any) -> Any:
-    """`value`, if that is what it is."""
+    """`value`, if it is exactly of this kind; raises `ValueError` if not."""
     if type(value) is not kind:
         msg = f"{type(value).__name__} where {kind.__name__} was expected"
         raise ValueError(msg)
@@ -262,13 +265,13 @@ def exactly(kind: type[Any], value: Any) -> Any:
 
 
 def bytes_of(value: Any) -> bytes:
-    """Bytes, which Python 3 writes as text into protocol 2; made when asked for, as many may share one text."""
+    """Bytes, which Python 3 writes as text in protocol 2; converted only on request, as many may share one text."""
     encoded: bytes = value.encode("latin1") if type(value) is str else exactly(bytes, value)
     return encoded
 
 
 def dtype_of(record: Record) -> np.dtype[Any]:
-    """The type of numbers that a record of one stands for."""
+    """The NumPy type that a record of one stands for."""
     code = record.args[0] if record.args else None
     order = record.state[1] if type(record.state) is tuple and len(record.state) > 1 else "|"
     code, order = (text.decode("latin1") if type(text) is bytes else text for text in (code, order))
@@ -279,22 +282,22 @@ def dtype_of(record: Record) -> np.dtype[Any]:
 
 
 def scalar_of(record: Record) -> NDArray[Any]:
-    """NumPy's scalar that a record of one stands for; trackers count persons with them."""
+    """The NumPy scalar that a record of one stands for; trackers count persons with them."""
     dtype, raw = record.args
     return np.frombuffer(bytes_of(raw), dtype_of(exactly(Record, dtype)), count=1).reshape(())
 
 
 def is_plain(code: Any) -> bool:
-    """Whether this is NumPy's short name of a plain number, as `f4`."""
+    """Whether this is NumPy's short name of a plain type of numbers, such as `f4`."""
     return type(code) is str and re.fullmatch("[biuf][1248]", code) is not None
 
 
 def _made(called: Any, args: tuple[Any, ...]) -> Any:
-    """What a call of a name gives."""
-    if type(called) is Record:  # what a foreign call has given
+    """The result of calling a name."""
+    if type(called) is Record:  # the result of a foreign call
         return Record("foreign")
     kind = exactly(Name, called).kind
-    if kind == "new":  # Python 2's way to make an object: of its class, which is the first argument
+    if kind == "new":  # Python 2's way to make an object; its class is the first argument
         kind, args = exactly(Name, args[0]).kind, ()
     if kind == "mapping":
         return {}
@@ -304,9 +307,9 @@ def _made(called: Any, args: tuple[Any, ...]) -> Any:
 
 
 def _put(holder: Any, items: list[Any]) -> None:
-    """Puts keys and values into a dictionary, or what stands for one.
+    """Puts keys and values into a dictionary, or into a record that stands for one.
 
-    Keys that are neither words nor whole numbers are left out: to hash one may never end.
+    Keys that are neither text nor whole numbers are left out: hashing one may never end.
     """
     target = holder.items if type(holder) is Record else exactly(dict, holder)
     for key, value in zip(items[::2], items[1::2], strict=True):

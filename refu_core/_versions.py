@@ -8,7 +8,7 @@ VERSION = "0.2.0"
 
 
 def installed(distribution: str) -> str:
-    """The version of a distribution, or that it isn't installed: a source tree on the path has no metadata."""
+    """The version of a distribution, or "not installed": a source tree on the path has no metadata."""
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
@@ -16,5 +16,5 @@ def installed(distribution: str) -> str:
 
 
 def versions(*distributions: str) -> dict[str, str]:
-    """This project's version and theirs, by name."""
+    """The versions of this project and of these distributions, by name."""
     return {"refu-ros": VERSION, **{name: installed(name) for name in distributions}}

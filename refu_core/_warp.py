@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 @contextlib.contextmanager
 def _no_stderr() -> Iterator[None]:
-    """Warp's native code writes to the file descriptor itself, below `sys.stderr`."""
+    """Silences the file descriptor itself: that is where Warp's native code writes, below `sys.stderr`."""
     saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 2)
     try:
@@ -34,13 +34,13 @@ def _no_stderr() -> Iterator[None]:
 
 
 def _start_quietly() -> None:
-    # Warp's banner, and its word that a machine has no GPU, would land in a node's log and in a command's output.
+    # Warp's banner, and its message that a machine has no GPU, would end up in a node's log and in a command's output.
     if hasattr(wp.config, "log_level"):
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     else:  # releases before the logger
         wp.config.quiet = True
     with warnings.catch_warnings(), contextlib.nullcontext() if torch.cuda.is_available() else _no_stderr():
-        warnings.filterwarnings("ignore", "Support for Python", FutureWarning)  # by releases to come: pip minds that
+        warnings.filterwarnings("ignore", "Support for Python", FutureWarning)  # from future releases: pip sees to that
         try:
             wp.init()
         except OSError as error:
@@ -57,16 +57,16 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
 
 
 def memory(*shape: int, device: Any = "cpu", dtype: torch.dtype = torch.float32) -> Tensor:
-    """Zeros that call after call is computed in.
+    """A tensor of zeros to compute in, call after call.
 
-    Their type, their device and whether they are inference tensors don't hang on what the caller has set torch to.
+    Its type, its device and whether it is an inference tensor don't depend on the caller's settings of torch.
     """
     with torch.inference_mode(False):
         return torch.zeros(*shape, device=device, dtype=dtype)
 
 
 def refit(trees: Sequence[Any], device: torch.device) -> None:
-    """Fits trees to their points, on a GPU at the same time."""
+    """Refits trees to their points; on a GPU, all at the same time."""
     side_by_side([tree.refit for tree in trees], device)
 
 
@@ -76,17 +76,17 @@ def ints(values: Any, device: Any) -> Any:
 
 
 def recorded(kernel: Any, dim: int, inputs: Sequence[Any], device: Any) -> Any:
-    """A launch to be made again and again, on what its arrays hold by then."""
+    """A recorded launch, to be repeated on whatever its arrays hold by then."""
     command = wp.launch(kernel, dim, inputs, device=str(device), record_cmd=True)
-    command.kept = inputs  # it knows addresses
+    command.kept = inputs  # the command knows only their addresses
     return command
 
 
 class Repeated(threading.local):
-    """A kernel that is launched with other arrays of the same shapes again and again.
+    """A kernel that is launched again and again, each time with other arrays of the same shapes.
 
-    Making a launch's arguments in Python takes as long as the work of a small one. So they are made once for each
-    size, and told where the memory is from then on. Every thread has its own.
+    Preparing a launch's arguments in Python takes as long as a small launch itself. So they are made once for each
+    size, and from then on are only given new addresses. Every thread has its own.
     """
 
     def __init__(self, kernel: Any, kinds: Sequence[Any], fixed: Sequence[Any] = ()) -> None:
@@ -95,7 +95,7 @@ class Repeated(threading.local):
         self._known: dict[Any, tuple[Any, list[Any]]] = {}
 
     def __call__(self, dim: Sequence[int], *tensors: Tensor) -> None:
-        """Launches with contiguous tensors of one device, which are kept until the next launch of their sizes."""
+        """Launches with contiguous tensors of one device, which are kept alive until the next launch of these sizes."""
         device = tensors[0].device
         key = (device, *dim, *(tensor.shape for tensor in tensors), *(tensor.dtype for tensor in tensors))
         if key not in self._known:
@@ -116,10 +116,10 @@ class Repeated(threading.local):
 
 @functools.cache
 def strips(n: int, device: torch.device, *, at_least: int = 1) -> tuple[int, Tensor]:
-    """Into how many strips a kernel's n items are cut, and how many each has, int32, shape (1,).
+    """How many strips a kernel's n items are cut into, and how many items each strip has, int32, shape (1,).
 
-    A thread takes a strip. A CPU's compiler keeps more in registers in a loop than from thread to thread, so it gets
-    one strip; a GPU as many as there are items, of `at_least` so many each. The last one may be shorter.
+    A thread takes a strip. A CPU's compiler keeps more in registers within a loop than from thread to thread, so a CPU
+    gets one strip of all items. On a GPU each strip has `at_least` items; the last one may be shorter.
     """
     n_strips, each = (1, max(n, 1)) if device.type == "cpu" else (-(-n // at_least), at_least)
     with torch.inference_mode(False):
@@ -127,9 +127,9 @@ def strips(n: int, device: torch.device, *, at_least: int = 1) -> tuple[int, Ten
 
 
 IN_ROW = 32
-"""Items that a thread of a GPU adds up before all threads add to one number, one after another."""
+"""Items that a GPU's thread adds up by itself before all threads add to one number, one after another."""
 _MOST_SIZES = 64
-"""Sizes of a kernel's arguments that are remembered."""
+"""How many sizes of a kernel's arguments are remembered."""
 
 
 def is_plain(*tensors: Tensor) -> bool:
@@ -155,12 +155,12 @@ _NO_STREAM = contextlib.nullcontext()
 
 @functools.cache
 def _same_stream(stream: torch.cuda.Stream) -> Any:
-    """Warp's object of one of torch's few streams, kept: with the first one to go Warp would forget the stream."""
+    """Warp's object for one of torch's few streams, kept: once the first such object goes, Warp forgets the stream."""
     return wp.stream_from_torch(stream)
 
 
 def side_by_side(works: Sequence[Callable[[], Result]], device: torch.device) -> list[Result]:
-    """Does them in order; on a GPU each on a stream of its own, as the small launches of one leave most of it idle."""
+    """Runs works in order; on a GPU, each on its own stream, as the small launches of one leave most of it idle."""
     if device.type != "cuda" or len(works) < 2:
         return [work() for work in works]
     here = torch.cuda.current_stream(device)
@@ -176,12 +176,12 @@ def side_by_side(works: Sequence[Callable[[], Result]], device: torch.device) ->
 
 @functools.cache
 def _beside(stream: torch.cuda.Stream, n: int) -> list[torch.cuda.Stream]:
-    """Streams for what is done beside each other, kept."""
+    """Streams for works that run side by side, kept for later calls."""
     return [torch.cuda.Stream(stream.device) for _ in range(n)]  # type: ignore[no-untyped-call]
 
 
 @contextlib.contextmanager
 def joined_capture(device: torch.device) -> Iterator[Any]:
-    """Tells Warp that torch is capturing a CUDA graph; what this gives must live as long as the graph does."""
+    """Tells Warp that torch is capturing a CUDA graph; what this yields must live as long as the graph does."""
     with torch_stream(device), wp.ScopedCapture(external=True, force_module_load=False) as capture:
         yield capture

@@ -8,14 +8,14 @@ _MAX_TEXT = 300
 def printable(text: object) -> str:
     """One line for a terminal, a log or diagnostics, whatever a file or a peer has put into the text.
 
-    Control characters, lone surrogates and the like are escaped; of a text above 300 characters the middle is left out.
+    Control characters, lone surrogates and the like are escaped; the middle of a text above 300 characters is left out.
     """
     line = _shortened(" ".join(_shortened(str(text), 4 * _MAX_TEXT).split()), _MAX_TEXT)
     return _shortened("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line), _MAX_TEXT)
 
 
 def _shortened(text: str, most: int) -> str:
-    """The start says where the fault is, the end what to do; words stay whole where there are any."""
+    """Leaves out the middle: the start says where the fault is, the end what to do. Words stay whole if possible."""
     if len(text) <= most:
         return text
     start, end = text[: most - most // 3 - 3], text[-(most // 3) :]

@@ -15,18 +15,18 @@ N_JOINTS = 24
 N_BETAS = 10
 N_STYLES = 4
 LAGS = (1 / 15, 2 / 15, 4 / 15, 8 / 15)
-"""How long ago what `SmplFrame.past` tells of was [s]: cloth comes to rest within half a second, and what was last
-counts most."""
+"""How far back the moments described by `SmplFrame.past` are [s]: cloth comes to rest within half a second, and the
+latest motion counts most."""
 N_PAST = 9 * N_JOINTS + 3
-"""Numbers a lag: of each joint's rotation, and of the root's place."""
-# Limits of two levels. A frame holds whatever can be computed with: a study may go beyond all bodies. A stream of
-# messages has no such wish, so a node refuses (`msg_adapters.check_plausible`) what is beyond the plausible: no
-# sender means it.
+"""Numbers per lag: those of each joint's rotation, and of the root's place."""
+# There are two levels of limits. A frame accepts whatever can be computed with, as a study may go beyond real bodies.
+# A stream of messages has no such purpose, so a node refuses implausible values (`msg_adapters.check_plausible`): no
+# sender means them.
 MAX_ANGLE = 1e4
 """Rotation vectors have components up to this [rad]; in float32 larger ones no longer say which way a limb points."""
 MAX_COEFFICIENT = 100.0
-"""β and γ have components up to this: at 20 standard deviations no body is one, at 10,000 it is 500 m long, and a
-signed distance that looks around it centimetre by centimetre would never end."""
+"""β and γ have components up to this: at 20 standard deviations a shape is no body any more; at 10,000 it is 500 m
+long, and a signed distance that searches around it centimetre by centimetre would never end."""
 PLAUSIBLE_ANGLE = 1e3
 """[rad]"""
 PLAUSIBLE_COEFFICIENT = 20.0
@@ -40,11 +40,11 @@ def checked_numbers(
     """`value` as a read-only array of numbers up to `limit`; accepts any layout with the right number of elements."""
     try:
         given = np.ma.asanyarray(value) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
-        if given.dtype.kind not in "iufO":  # NumPy makes numbers of truth values, texts, dates and complex ones, too
+        if given.dtype.kind not in "iufO":  # NumPy also turns booleans, text, dates and complex ones into numbers
             msg = f"values of the type {given.dtype}"
             raise TypeError(msg)
         array = np.ma.filled(given.astype(np.float64), np.nan)
-    except (TypeError, ValueError, RuntimeError) as error:  # the last: a tensor that tracks gradients
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that tracks gradients
         msg = f"{name} must be {shape} numbers, got {type(value).__name__}: {error}"
         raise FrameError(msg) from error
     size = math.prod(shape)
@@ -53,7 +53,7 @@ def checked_numbers(
         msg = f"{name} must have the shape {' or '.join(map(str, wanted))}, got {array.shape}"
         msg += f": take the first {shape[0]}" if len(shape) == array.ndim == 1 and array.size > shape[0] else ""
         raise FrameError(msg)
-    largest = float(np.abs(array).max())  # NaN or infinite as soon as one is
+    largest = float(np.abs(array).max())  # NaN or infinite if any value is
     if not math.isfinite(largest):
         bad = int(np.count_nonzero(~np.isfinite(array)))
         msg = f"{name} has {bad} value{'s' if bad > 1 else ''} that {'are' if bad > 1 else 'is'} NaN or infinite"
@@ -75,7 +75,7 @@ class SmplFrame:
 
     The root and `transl` may be in any other right-handed axes, as long as `up` says which way is up there.
 
-    Raises `FrameError` when an array has a wrong number of elements, isn't finite, or is beyond all bodies.
+    Raises `FrameError` when an array has a wrong number of elements, isn't finite, or is out of range.
     """
 
     pose: NDArray[np.float32]
@@ -89,10 +89,10 @@ class SmplFrame:
     stamp_ns: int = 0
     """Time of the measurement [ns since the epoch of the sender's clock]."""
     up: NDArray[np.floating] = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
-    """Away from the ground, in the axes of the root and `transl`, shape (3,); of a length from 1e-6 to
+    """Direction away from the ground, in the axes of the root and `transl`, shape (3,); of a length from 1e-6 to
     1e6, kept as a unit vector. Cloth hangs the other way."""
     past: NDArray[np.float32] | None = None
-    """How the person moved until now, as `PoseHistory` says it, shape (4, 219): see there; None for not at all."""
+    """How the person has moved until now, as `PoseHistory` describes it, shape (4, 219); None for no motion."""
 
     def __post_init__(self) -> None:
         # A frozen dataclass is normalised through object.__setattr__, once, here.
@@ -104,7 +104,7 @@ class SmplFrame:
                 self, "style", checked_numbers("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT)
             )
         up = checked_numbers("up", self.up, (3,), np.float64)
-        with np.errstate(over="ignore"):  # which is no direction, either
+        with np.errstate(over="ignore"):  # an infinite length is no direction, either
             length = float(np.linalg.norm(up))
         if not 1e-6 <= length <= 1e6:
             msg = f"up must be a direction, of a length from 1e-6 to 1e6, got {self.up!r}"
@@ -120,6 +120,6 @@ class SmplFrame:
             raise FrameError(msg) from error
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy is checked and read-only, too: NumPy forgets that when it copies or pickles."""
+        """Checks a copy and makes it read-only, too: NumPy forgets that when it copies or pickles."""
         self.__dict__.update(state)
         self.__post_init__()

@@ -1,4 +1,4 @@
-"""How people have moved until now: a swinging skirt can't be told from a pose alone."""
+"""How people have moved until now: how a skirt swings can't be told from a pose alone."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from refu_core.errors import FrameError, require_type
 from refu_core.frames import LAGS, N_JOINTS, SmplFrame
 
 _MOST_PEOPLE = 64
-"""Those who were seen last are remembered; each takes half a megabyte at most."""
+"""How many people are remembered, those seen last; each takes half a megabyte at most."""
 _CLOSEST_NS = 1_000_000_000 // 240
-"""Frames nearer to each other than this replace one another, so that no rate fills the memory."""
+"""Frames closer together in time than this replace one another, so that no frame rate fills the memory."""
 _FASTEST = 15.0
-"""Who moves faster is somebody else, or was lost and found [m/s]; sprinters reach 12."""
+"""Anybody who moves faster is somebody else, or was lost and found again [m/s]; sprinters reach 12."""
 _SHORTEST = 1 / 30
-"""A speed is that over at least so long [s]: messages that were queued are stamped as they come, one upon the other."""
+"""Speeds are taken over at least this long [s]: queued messages are stamped on arrival, one right after another."""
 _LONGEST_PAUSE = 0.25
-"""Between frames farther apart nobody knows the motion [s]."""
+"""Between frames farther apart than this, the motion is unknown [s]."""
 _LAGS = np.array(LAGS)
 
 
@@ -38,16 +38,16 @@ class _Moment(NamedTuple):
 
 
 class PoseHistory:
-    """Tells frames of the half second before them: `SmplFrame.past`, for pipelines with the backbone `dynamic`.
+    """Adds to frames the half second before them, as `SmplFrame.past`, for pipelines with the backbone `dynamic`.
 
-    Nothing is kept but the frames of that half second, so nothing can drift. Before somebody's first frame they are
-    taken to have stood still, as after a pause of a quarter of a second, a clock that went back, and a leap. Frames may
-    come at any rate from 4 Hz on, and twice: of two with one stamp the later counts. Not thread-safe.
+    Only the frames of that half second are kept, so nothing can drift. People are taken to have stood still before
+    their first frame, and after a pause of over a quarter of a second, a clock that went back, or a leap. Frames may
+    come at any rate from 4 Hz on, and twice: of two with the same stamp the later counts. Not thread-safe.
 
-    `past` is what was `LAGS` ago, less what is now, of the shape (4, 219): nine numbers of each joint's rotation
-    relative to its parent, row by row, those of the root as it sees itself; then where the root was [m], in its axes,
-    beside where it would have been at the mean speed of the longest lag. It is zero for whoever stands, and for whoever
-    glides: the air is taken to move along, as in the simulation.
+    `past` is the state `LAGS` ago minus the state now, shape (4, 219): nine numbers of each joint's rotation relative
+    to its parent, row by row, those of the root in its own axes; then where the root was [m], in its axes, relative to
+    where it would have been at the mean speed of the longest lag. It is zero for a person who stands still, and for one
+    who glides: the air is taken to move along, as in the simulation.
 
     Example:
         >>> history = PoseHistory()
@@ -59,7 +59,7 @@ class PoseHistory:
         self._people: OrderedDict[str, deque[_Moment]] = OrderedDict()
 
     def __call__(self, frame: SmplFrame, person: str = "") -> SmplFrame:
-        """A person's next frame, with its past. Raises `FrameError` for what is none."""
+        """A person's next frame, with its past. Raises `FrameError` for anything but a frame and a name."""
         require_type(frame, SmplFrame, "an SmplFrame", error=FrameError)
         require_type(person, str, "a person's name", error=FrameError)
         now = _Moment(frame.stamp_ns, Rotation.from_rotvec(frame.pose.astype(np.float64)).as_matrix(), frame.transl)
@@ -84,22 +84,22 @@ class PoseHistory:
         return [*map(cls(), frames)]
 
     def forget(self, person: str = "") -> None:
-        """Somebody has left."""
+        """Forgets a person who has left."""
         self._people.pop(person, None)
 
 
 def _goes_on(last: _Moment, now: _Moment) -> bool:
-    """Whether it is the same motion."""
+    """Whether `now` continues the motion of `last`."""
     passed = now.stamp_ns - last.stamp_ns
     way = float(np.linalg.norm(now.transl - last.transl))
     return -_CLOSEST_NS < passed <= 1e9 * _LONGEST_PAUSE and way <= _FASTEST * max(1e-9 * passed, _SHORTEST)
 
 
 def _past(moments: Sequence[_Moment]) -> NDArray[np.float32]:
-    """Of the last of these, shape (4, 219)."""
+    """`SmplFrame.past` of the last of these moments, shape (4, 219)."""
     now = moments[-1]
     ages = [1e-9 * (moment.stamp_ns - now.stamp_ns) for moment in moments]
-    place = np.interp(-_LAGS, ages, np.arange(len(ages)))  # the first one's before it
+    place = np.interp(-_LAGS, ages, np.arange(len(ages)))  # before the first moment, that one
     before = place.astype(int)
     after = np.minimum(before + 1, len(ages) - 1)
     share = place - before

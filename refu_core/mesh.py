@@ -17,7 +17,7 @@ _Float = TypeVar("_Float", np.float32, np.float64)
 
 
 class Adjacency(NamedTuple):
-    """What is around each vertex of a mesh of V vertices: of vertex v `items[start[v]:start[v + 1]]`."""
+    """What is around each vertex of a mesh of V vertices: around vertex v, `items[start[v]:start[v + 1]]`."""
 
     start: NDArray[np.int32]
     """Shape (V + 1,)."""
@@ -32,7 +32,7 @@ class Adjacency(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Connectivity:
-    """Who is next to whom in a triangle mesh of V vertices and F faces; what is asked is computed once."""
+    """What is next to what in a triangle mesh of V vertices and F faces; each result is computed once, on request."""
 
     faces: NDArray[np.int32]
     """Vertices of each face, counter-clockwise seen from outside, shape (F, 3)."""
@@ -41,13 +41,13 @@ class Connectivity:
 
     @classmethod
     def of(cls, faces: Any, n_vertices: int | None = None) -> Connectivity:
-        """Of `faces`, integers of shape (F, 3), and as many vertices as they name, if not told; raises `MeshError`."""
+        """For `faces`, integers of shape (F, 3), and by default as many vertices as they name; raises `MeshError`."""
         checked = check_faces(faces, n_vertices=n_vertices)
         return cls(checked, int(checked.max()) + 1 if n_vertices is None else n_vertices)
 
     @cached_property
     def _edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Lower end times V plus upper end of each edge, the edge of each corner, the number of faces of each edge."""
+        """Each edge's lower end times V plus its upper end, the edge of each corner, each edge's number of faces."""
         start, end = self.faces.astype(np.int64), np.roll(self.faces, -1, axis=1).astype(np.int64)
         keys = np.minimum(start, end) * self.n_vertices + np.maximum(start, end)
         edges, of_corner, n_faces = np.unique(keys.ravel(), return_inverse=True, return_counts=True)
@@ -60,24 +60,24 @@ class Connectivity:
 
     @property
     def edge_of_corner(self) -> NDArray[np.int64]:
-        """Number of the edges (0, 1), (1, 2), (2, 0) of each face, shape (F, 3)."""
+        """The numbers of the edges (0, 1), (1, 2), (2, 0) of each face, shape (F, 3)."""
         return self._edges[1]
 
     @property
     def n_faces_of_edge(self) -> NDArray[np.int64]:
-        """How many faces each edge has, shape (E,): one on the boundary, two elsewhere, of a manifold."""
+        """How many faces each edge has, shape (E,): in a manifold, one on the boundary and two elsewhere."""
         return self._edges[2]
 
     @property
     def boundary(self) -> NDArray[np.int32]:
-        """The edges of one face, shape (B, 2)."""
+        """The edges that have only one face, shape (B, 2)."""
         boundary: NDArray[np.int32] = self.edges[self.n_faces_of_edge == 1]
         return boundary
 
     @cached_property
     def ring(self) -> Adjacency:
         """The vertices that edges join to each vertex."""
-        pairs = np.concatenate((self.edges[:, ::-1], self.edges))  # stable: those of lower number first
+        pairs = np.concatenate((self.edges[:, ::-1], self.edges))  # sorting is stable: lower numbers come first
         return _grouped(pairs[:, 0], pairs[:, 1], self.n_vertices)
 
     @cached_property
@@ -86,7 +86,7 @@ class Connectivity:
         return _grouped(self.faces.ravel(), np.repeat(np.arange(len(self.faces)), 3), self.n_vertices)
 
     def independent(self) -> NDArray[np.bool_]:
-        """A maximal independent set, shape (V,): no edge joins two of it, and whoever isn't in it is next to one."""
+        """A maximal independent set, shape (V,): no edge joins two of its vertices, and every other is next to one."""
         is_free, chosen = np.ones(self.n_vertices, np.bool_), np.zeros(self.n_vertices, np.bool_)
         start, items = self.ring
         for vertex in range(self.n_vertices):
@@ -124,12 +124,12 @@ class Connectivity:
         return across.reshape(-1, 3)
 
     def adjacency_matrix(self) -> sparse.csr_array:
-        """1 for each two vertices of an edge, shape (V, V)."""
+        """1 for each pair of vertices that an edge joins, shape (V, V)."""
         shape = (self.n_vertices, self.n_vertices)
         return sparse.csr_array((np.ones(len(self.ring.items)), self.ring.items, self.ring.start), shape=shape)
 
     def uniform_laplacian(self) -> sparse.csr_array:
-        """The matrix that takes the mean of its neighbours from each vertex, shape (V, V)."""
+        """The matrix that subtracts from each vertex the mean of its neighbours, shape (V, V)."""
         adjacent = self.adjacency_matrix()
         degree = np.maximum(adjacent.sum(axis=1), 1.0)
         return sparse.csr_array(sparse.eye_array(self.n_vertices) - sparse.diags_array(1.0 / degree) @ adjacent)
@@ -138,7 +138,7 @@ class Connectivity:
 def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int32]:
     """`faces` (a tensor, too) as a contiguous int32 array of shape (F, 3).
 
-    Raises `MeshError` where they aren't integers of that shape, three different ones each, below `n_vertices`.
+    Raises `MeshError` unless they are integers of that shape below `n_vertices`, three different ones per face.
     """
     array = np.asarray(faces.cpu() if hasattr(faces, "cpu") else faces)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
@@ -158,14 +158,14 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
 
 
 def linked(pairs: NDArray[np.integer], n: int) -> tuple[int, NDArray[np.int64]]:
-    """How many groups the links (L, 2) make of n things, and the group of each, numbered from the first thing on."""
+    """How many groups the links (L, 2) join n things into, and the group of each, numbered from the first thing on."""
     graph = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     count, label = connected_components(graph, directed=False)
     return int(count), label.astype(np.int64)
 
 
 def rim_of(faces: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Which edges (0, 1), (1, 2), (2, 0) of faces (F, 3) have no face that goes along them the other way, (F, 3)."""
+    """Which edges (0, 1), (1, 2), (2, 0) of faces (F, 3) have no face that runs through them the other way, (F, 3)."""
     start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
     n = int(faces.max(initial=0)) + 1
     return ~np.isin(start * n + end, end * n + start)
@@ -174,10 +174,10 @@ def rim_of(faces: NDArray[np.int32]) -> NDArray[np.bool_]:
 def as_points(
     name: str, values: Any, n: int | None = None, *, dtype: type[np.floating[Any]] = np.float64
 ) -> NDArray[Any]:
-    """`values` (a tensor, too) as finite points of a type, contiguous, shape (n, 3).
+    """`values` (a tensor, too) as contiguous, finite points of the type `dtype`, shape (n, 3).
 
     Raises:
-        MeshError: they aren't that.
+        MeshError: they aren't finite numbers of that shape.
     """
     try:
         points = np.ascontiguousarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=dtype)
@@ -191,12 +191,12 @@ def as_points(
         bad = int((~np.isfinite(points)).any(axis=1).sum())
         msg = f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates"
         raise MeshError(msg)
-    # Torch warns of arrays that are read-only, as a pipeline's are.
+    # Torch warns about read-only arrays, and those of a pipeline are.
     return points if points.flags.writeable else points.copy()
 
 
 def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:
-    """Unit normals at the vertices (V, 3) of faces (F, 3): the mean of the faces around each, by area; shape (V, 3)."""
+    """Unit normals at vertices (V, 3) of faces (F, 3): the area-weighted mean of faces around each, shape (V, 3)."""
     a, b, c = vertices[faces].transpose(1, 0, 2)
     normals = np.zeros_like(vertices)
     np.add.at(normals, faces, np.cross(b - a, c - a)[:, None])
@@ -218,7 +218,7 @@ def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
 
 
 def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int64]:
-    """An order of places (N, 3) in which each eight (or `width`), each 64, and so on are close together."""
+    """An order of places (N, 3) in which every eight (or `width`) in a row, every 64, and so on are close together."""
     n = len(places)
     sizes_of_groups = width ** np.arange(20, dtype=np.int64)
     order, bounds = np.arange(n), np.array([0, n])
@@ -230,10 +230,10 @@ def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int
         groups, axis = np.arange(len(starts)), extent.argmax(1)
         group = np.repeat(groups, sizes)
         along = here[np.arange(n), axis[group]] - low[groups, axis][group]
-        # Whole numbers keep groups apart: one sort takes half the time of two.
+        # The integer part of a key keeps groups apart: one sort takes half the time of two.
         key = group + 0.5 * along / np.maximum(extent[groups, axis], np.finfo(np.float32).tiny)[group]
         order = order[np.argsort(key, kind="stable")]
-        # Into halves, of whole groups of the next smaller size: only the last one of all may have less.
+        # Cuts into halves of whole groups of the next smaller size: only the very last group may have fewer.
         unit = sizes_of_groups[np.searchsorted(sizes_of_groups, sizes[is_open]) - 1]
         half = np.maximum(-(-sizes[is_open] // unit) // 2, 1) * unit
         bounds = np.union1d(bounds, starts[is_open] + half)

@@ -1,6 +1,6 @@
 """Settings that say what they are for: fields of a dataclass, which nodes take as parameters and commands as options.
 
-What loads torch is imported where it is needed: a mistyped setting is answered before that.
+Modules that load torch are imported only where needed, so that a mistyped setting is reported before that.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SettingsError(RefuError, ValueError):
 
 @dataclass(frozen=True)
 class Spec:
-    """What there is to know of a setting."""
+    """All there is to know about a setting."""
 
     default: Any
     description: str
@@ -46,13 +46,13 @@ class Spec:
     live: bool = True
     """Whether it may change while a node runs."""
     metavar: str = ""
-    """What stands for the value in the help of a command: FILE and DIR for paths."""
+    """Stands for the value in a command's help; FILE and DIR for paths."""
     parse: Callable[[str], Any] | None = None
-    """Reads what a command was given, where the default doesn't say what that is."""
+    """Parses the text that a command was given, where the default doesn't tell the type."""
 
     @property
     def kind(self) -> type:
-        """Of the value, or of a list's items."""
+        """The type of the value, or of a list's items."""
         return type(self.default[0] if isinstance(self.default, tuple) and self.default else self.default)
 
 
@@ -62,7 +62,7 @@ def setting(default: Any, description: str, **limits: Any) -> Any:
 
 
 fixed = partial(setting, live=False)
-"""A field that is a setting, and doesn't change while a node runs."""
+"""A field that is a setting, and can't change while a node runs."""
 
 
 def specs_of(kind: Any) -> dict[str, Spec]:
@@ -71,7 +71,7 @@ def specs_of(kind: Any) -> dict[str, Spec]:
 
 
 def check(settings: Any) -> None:
-    """Raises `SettingsError` for a value out of its range, or that isn't among its choices; None isn't one."""
+    """Raises `SettingsError` for a value out of its range, or not among its choices; None is allowed there."""
     for name, spec in specs_of(type(settings)).items():
         value = getattr(settings, name)
         if spec.choices and value not in (*spec.choices, None):
@@ -79,13 +79,13 @@ def check(settings: Any) -> None:
             raise SettingsError(msg)
         low, high = spec.within or (-math.inf, math.inf)
         for number in (value if isinstance(value, tuple) else (value,)) if spec.within else ():
-            if not low <= number <= high:  # NaN isn't, either
+            if not low <= number <= high:  # NaN fails this, too
                 msg = f"{name}: wanted {low:g} to {high:g}, got {number:g}"
                 raise SettingsError(msg)
 
 
 def arguments(settings: Any, *names: str) -> list[str]:
-    """Settings as a command takes them, by name; without those that have their defaults, or were left empty."""
+    """The named settings as a command's arguments, without flags at their default and settings left empty."""
     found = []
     for name in names:
         value, flag = getattr(settings, name), name.replace("_", "-")
@@ -98,7 +98,7 @@ def arguments(settings: Any, *names: str) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class PipelineOptions:
-    """What is worn by whom, and by what it is computed: where one of these changes, another pipeline is needed."""
+    """What is worn by whom, and how it is computed: if one of these changes, another pipeline is needed."""
 
     garments: tuple[str, ...] = setting(DEFAULT_GARMENTS, "Garments that every person wears.", metavar="A,B")
     body: str = setting(
@@ -127,16 +127,16 @@ class PipelineOptions:
 
     @property
     def pipeline(self) -> PipelineOptions:
-        """These alone, of settings that are more."""
+        """These settings alone, without those that a subclass adds."""
         return PipelineOptions(**{name: getattr(self, name) for name in PIPELINE_OPTIONS})
 
     @property
     def of_one_style(self) -> list[str]:
-        """The garments that hear of no style."""
+        """The garments that have only one style, and ignore γ."""
         return [name for name in self.garments if _template(name).styledirs is None]
 
     def check_garments(self) -> None:
-        """Raises `SettingsError` for garments that there aren't, or that nobody wears together."""
+        """Raises `SettingsError` for garments that don't exist, or that can't be worn together."""
         if not self.garments or len(set(self.garments)) < len(self.garments):
             msg = f"garments: wanted distinct names, at least one, got {list(self.garments)}"
             raise SettingsError(msg)
@@ -151,7 +151,7 @@ class PipelineOptions:
             raise SettingsError(msg)
 
     def check_files(self) -> None:
-        """Raises `RefuError` for a device, a body or weights that there aren't, as far as that shows at once."""
+        """Raises `RefuError` for a device, a body or weights that don't exist, as far as can be seen at once."""
         from refu_core._device import checked_device
         from refu_core.weights import weights_folder
 
@@ -190,7 +190,7 @@ PIPELINE_OPTIONS = tuple(specs_of(PipelineOptions))
 
 @dataclass(frozen=True, kw_only=True)
 class DressOptions(PipelineOptions):
-    """The same, and how it is worn."""
+    """`PipelineOptions`, and how the garments are worn."""
 
     margin: float = setting(
         DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", within=(0.0, MAX_MARGIN), metavar="M"
@@ -215,16 +215,16 @@ class DressOptions(PipelineOptions):
 
     @property
     def betas_are_told(self) -> bool:
-        """Whether it is known what betas that arrive are of."""
+        """Whether it is known which body the arriving betas belong to."""
         return bool(self.body or self.betas_from) or self.betas_source != BetasSource.MESSAGE
 
     @property
     def known_betas(self) -> tuple[float, ...] | None:
-        """The shape of everybody, whatever arrives; None where what arrives counts."""
+        """Everybody's shape, whatever arrives; None where the arriving betas count."""
         return self.betas if self.betas_source == BetasSource.FIXED else None
 
     def applied(self, frame: SmplFrame) -> SmplFrame:
-        """The frame with the shape and style that are asked for; a style that it has stays."""
+        """The frame with the shape and style that were set; a style of its own stays."""
         if self.known_betas is not None:
             frame = replace(frame, betas=np.array(self.known_betas, np.float32))
         if frame.style is None and any(self.style):

@@ -15,6 +15,6 @@ PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13
 """Parent of each SMPL joint, -1 for the root; parents come before their children."""
 
 CARRIED = np.eye(len(PARENTS))
-"""1 where a joint (row) moves with another (column) that turns: it hangs from that one or is it, shape (24, 24)."""
+"""1 where a joint (row) moves when another (column) turns: it hangs from that one, or is that one, shape (24, 24)."""
 for _joint, _parent in enumerate(PARENTS[1:], start=1):
     CARRIED[_joint] += CARRIED[_parent]

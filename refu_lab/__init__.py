@@ -1,1 +1,1 @@
-"""The commands of `refu`, and all that measures; imported by none of the other packages."""
+"""The commands of `refu` and everything that measures; none of the other packages imports it."""

@@ -1,4 +1,4 @@
-"""Ray casting kernels of the renderer: what light reaches a point, and what a pixel sees."""
+"""Ray casting kernels of the renderer: how much light reaches a point, and what a pixel sees."""
 
 import warp as wp
 
@@ -54,7 +54,7 @@ def light_kernel(
             total += weight
             query = wp.mesh_query_ray(mesh, start, d, reach)
             if query.result:
-                # What is far off closes the sky less than what is near.
+                # Far surfaces hide less of the sky than near ones.
                 unseen += weight * (1.0 - query.t / reach)
     sky[i] = 1.0 - unseen / wp.max(total, 1e-6)
 
@@ -135,13 +135,13 @@ def pixel_kernel(
             direct = vertex_mean(sun, faces, face, bary)
             ambient = vertex_mean(sky, faces, face, bary)
             if wp.dot(query.normal, ray) > 0.0:
-                # The inside of cloth: lit by the little that comes in or through.
+                # The inside of cloth is lit by the little light that gets in or through.
                 n = -n
                 direct = 0.0
                 ambient = 0.35
             lambert = wp.max(wp.dot(n, to_sun), 0.0) * direct
             dome = wp.vec3(0.56, 0.58, 0.62) * (0.62 + 0.38 * n[1]) * (ambient * sky_strength)
-            # Rays that leave at a grazing angle look a little paler, as cloth and skin do.
+            # Cloth and skin look a little paler at grazing angles.
             rim = wp.pow(1.0 - wp.clamp(-wp.dot(n, ray), 0.0, 1.0), 4.0) * 0.16 * ambient
             light = wp.vec3(1.02, 0.97, 0.90) * (sun_strength * lambert) + dome
             colour = wp.cw_mul(albedo, light) + wp.vec3(rim, rim, rim)

@@ -1,4 +1,4 @@
-"""The post-process by optimisation that the paper compares itself with. NumPy and SciPy, one garment."""
+"""The optimisation post-process that the paper compares with, in NumPy and SciPy, for one garment."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _CLEARANCE = 0.001
 
 
 class PostProcess:
-    """Post-processes by least squares for garments of one mesh, whose Laplacian is built once."""
+    """Post-processes garments of one mesh by least squares; the mesh's Laplacian is built once."""
 
     def __init__(self, faces: Tensor | NDArray[np.int64], n_vertices: int) -> None:
-        """For garments of these `faces`, shape (G, 3); raises `MeshError` for one that names a vertex there isn't."""
+        """For garments with these `faces`, shape (G, 3); raises `MeshError` for a face of a vertex that isn't there."""
         mesh = Connectivity.of(faces.cpu() if isinstance(faces, Tensor) else faces, n_vertices)
         self._laplacian = mesh.uniform_laplacian()  # x_i minus the mean of its neighbours, (N, N)
 
@@ -38,17 +38,17 @@ class PostProcess:
     ) -> Tensor:
         """The optimisation of DRAPE (Guan et al. 2012), the paper's "Opt. Post-Process": garment vertices [m], (N, 3).
 
-        Each round minimises p + λ_s s + λ_d d over the garment y, with ỹ what the round before has left:
+        Each round minimises p + λ_s s + λ_d d over the garment y, where ỹ is the result of the round before:
         p = Σ (nᵢᵀ(yᵢ - bᵢ) - ε)² over the vertices inside, bᵢ the closest point of the skin and nᵢ its normal;
         s = Σ |(yᵢ - ỹᵢ) - mean over neighbours of (y - ỹ)|²; d = Σ |yᵢ - ỹᵢ|². Pairs (i, bᵢ) are found anew each round.
-        DRAPE leaves ε open, and takes the closest vertex for bᵢ; the closest point is its better.
+        DRAPE doesn't specify ε, and takes the closest vertex for bᵢ; the closest point is better.
 
         Args:
             points: Garment vertices [m], shape (N, 3).
-            ask: The signed distance of such vertices to the body.
-            clearance: ε, how far outside the vertices are to end [m].
-            reach: Vertices that are nearer to the skin than this are brought to `clearance`, too [m]. DRAPE's is 0:
-                only those inside are, and edges between others may still cut through the body.
+            ask: Gives the signed distance of such vertices to the body.
+            clearance: ε, how far outside the body the vertices should end up [m].
+            reach: Vertices nearer to the skin than this are also brought to `clearance` [m]. DRAPE's is 0: it moves
+                only those inside, and edges between others may still cut through the body.
         """
         for smoothness, damping in DRAPE_ROUNDS:
             sample = ask(points)
@@ -69,14 +69,14 @@ class PostProcess:
         smoothness: float,
         damping: float,
     ) -> Tensor:
-        """Displacement y - ỹ that solves one round, shape (N, 3)."""
+        """The displacement y - ỹ that solves one round, shape (N, 3)."""
         n = self._laplacian.shape[0]
         # nᵀ(y - b) - ε = nᵀu - (ε - f) for the displacement u: one row for each vertex inside, three columns each.
         columns = 3 * inside[:, None] + np.arange(3)
         rows = np.repeat(np.arange(len(inside)), 3)
         push = coo_array((normal.ravel(), (rows, columns.ravel())), shape=(len(inside), 3 * n)).tocsr()
         smooth = self._laplacian.T @ self._laplacian * smoothness + damping * eye_array(n)
-        # Damping bounds the condition number by about 40: conjugate gradients need no factorisation.
+        # Damping bounds the condition number by about 40, so conjugate gradients converge without a factorisation.
         solution, failed = cg(push.T @ push + kron(smooth, eye_array(3)), push.T @ deficit, rtol=1e-8, maxiter=1000)
         assert not failed
         return torch.from_numpy(solution.reshape(n, 3))

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; more threads would wait for busy cores
 
 from refu_core import RefuError, __version__
 from refu_core.errors import printable
@@ -28,7 +28,7 @@ from refu_lab.commands._common import (
 )
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
-"""Packages of the extra `lab`; others that may be missing are of `train`."""
+"""Packages of the extra `lab`; any other that may be missing belongs to `train`."""
 
 
 def _parser() -> Parser:
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(f"error: {error}", EXIT_BAD_INPUT)
     except (OSError, UnicodeError, MemoryError, RecursionError) as error:
         return _failed(f"error: {str(error) or type(error).__name__}", EXIT_BAD_INPUT)
-    except ModuleNotFoundError as error:  # an extra's package; those of the core are imported by every command
+    except ModuleNotFoundError as error:  # a package of an extra: every command imports those of the core
         extra = "lab" if str(error.name).partition(".")[0] in _OF_LAB else "train"
         return _failed(f'error: {error.name} is not installed: pip install "refu-ros[{extra}]"', EXIT_BAD_INPUT)
     except KeyboardInterrupt:
@@ -84,13 +84,13 @@ _WRITTEN = ("json", "output", "report", "picture")
 
 
 def _outputs(args: argparse.Namespace) -> dict[str, Path]:
-    """What a command writes, of files and folders, by option."""
+    """The files and folders that a command writes, by option."""
     given = {name: getattr(args, name, None) for name in _WRITTEN}
     return {f"--{name}": Path(path) for name, path in given.items() if path is not None and "://" not in str(path)}
 
 
 def _inputs(args: argparse.Namespace, *, written: Path) -> list[Path]:
-    """What a command reads that may be lost to a file that is `written`: recordings, and whatever is that file."""
+    """A command's inputs that writing the file `written` could destroy: recordings, and any input that is that file."""
     flat = [
         (name, one)
         for name, value in vars(args).items()
@@ -101,7 +101,7 @@ def _inputs(args: argparse.Namespace, *, written: Path) -> list[Path]:
 
 
 def _failed(reason: str, code: int) -> int:
-    """Says why in one line; with REFU_DEBUG, also where."""
+    """Prints the reason in one line, with REFU_DEBUG also the traceback; returns the code."""
     if os.environ.get("REFU_DEBUG") and code != EXIT_INTERRUPTED:
         traceback.print_exc()
     print(f"refu: {printable(reason)}", file=sys.stderr)

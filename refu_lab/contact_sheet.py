@@ -28,10 +28,10 @@ def contact_sheet(
     body: str | Path | None = None,
     garments: Sequence[str | Path] | None = None,
 ) -> NDArray[np.uint8]:
-    """Draws `count` random samples of a set, or all of a smaller one, each from the front and from behind.
+    """Draws `count` random samples of a set (or all, if it has fewer), each from the front and from behind.
 
-    `body` is that which the set was made for, by name or file, `garments` its garments; None for those that the card
-    names. Returns sRGB, shape (height, width, 3). Raises `SimulationError` where the set was made for another body.
+    `body` is the one that the set was made for, by name or file, and `garments` are its garments; None takes those that
+    the card names. Returns sRGB, shape (height, width, 3). Raises `SimulationError` if the set is for another body.
     """
     templates = {one.name: one for one in map(load_garment, dataset.parts if garments is None else garments)}
     model = load_body(next(iter(templates.values())).body if body is None else body)

@@ -1,4 +1,4 @@
-"""The bag that a replay writes: what came in, the garments, the body that they are on, and diagnostics."""
+"""The bag that a replay writes: the input messages, the garments, the body that wears them, and diagnostics."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 GARMENTS_TOPIC, BODY_TOPIC, DIAGNOSTICS_TOPIC = "/garments", "/body", "/diagnostics"
 _LAST_STAMP_NS = 2**31 * 10**9 - 1
-"""The last time that a message holds."""
+"""The latest stamp that a message can hold."""
 
 
 def garment_encoder(pipeline: GarmentPipeline, options: ReplayOptions) -> adapters.MarkerArrayEncoder:
-    """Of the pipeline's garments, in their order, each in its own colour."""
+    """The encoder of the pipeline's garments, in their order, each in its own colour."""
     meshes = [
         adapters.MarkerMesh(
             ns=adapters.garment_namespace(name),
@@ -42,7 +42,7 @@ def garment_encoder(pipeline: GarmentPipeline, options: ReplayOptions) -> adapte
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """An interrupt waits until this ends: a bag that is left in the middle of a message can't be read."""
+    """Delays interrupts until the block ends: a bag that breaks off in the middle of a message can't be read."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -58,9 +58,9 @@ def _undisturbed() -> Iterator[None]:
 
 
 class DressedBag:
-    """The topics of the node, without the node: a viewer that shows the one shows the other.
+    """Writes the topics of the node, without the node: a viewer that shows the node shows this bag, too.
 
-    Diagnostics hold nothing that a clock has measured, so that a replay writes the same bag again.
+    Diagnostics hold no measured times, so that replaying again writes the same bag.
 
     Raises `BagError` when `options.output` can't be written.
     """
@@ -90,7 +90,7 @@ class DressedBag:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """Finishes the bag, also after an exception; of one without a frame nothing is left."""
+        """Finishes the bag, also after an exception; removes a bag without a frame."""
         with _undisturbed():
             if self._is_empty:
                 self._writer.discard()
@@ -98,10 +98,10 @@ class DressedBag:
 
     @_undisturbed()
     def add_skip(self, record: FrameRecord, reason: str) -> None:
-        """A message as it came, and why it was not replayed."""
+        """Writes a message as it came, and why it was not replayed."""
         self._skipped += 1
         self._add_input(record)
-        stamp_ns = min(record.stamp_ns, _LAST_STAMP_NS)  # it may be the very reason
+        stamp_ns = min(record.stamp_ns, _LAST_STAMP_NS)  # the stamp may be the reason
         self._say(record, stamp_ns, [self._input(ERROR, reason)])
 
     @_undisturbed()
@@ -113,7 +113,7 @@ class DressedBag:
         garments: bytes,
         exact: Mapping[str, GarmentRecord] | None,
     ) -> None:
-        """A message as it came, its garments as bytes, and what exact checks have found, where there were any."""
+        """Writes a message as it came, its encoded garments, and what exact checks found, if there were any."""
         self._is_empty = False
         self._add_input(record)
         self._writer.write(GARMENTS_TOPIC, garments, log_time_ns=record.log_time_ns)
@@ -136,7 +136,7 @@ class DressedBag:
         return adapters.DiagnosticStatus(level, "refu replay: input", message, values=values)
 
     def _garment(self, name: str, output: PipelineOutput, exact: GarmentRecord | None) -> adapters.DiagnosticStatus:
-        """By exact checks of this frame where it was evaluated, otherwise by what collision handling says of itself."""
+        """A garment's status: by exact checks if the frame was evaluated, else by what collision handling reports."""
         stats = output.stats.garments[name]
         n_inside, n_pairs = (stats.n_unresolved, 0) if exact is None else exact.after[:2]
         values = {

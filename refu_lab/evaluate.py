@@ -1,4 +1,4 @@
-"""What `refu evaluate` does: the paper's tables and figures, each beside the paper's, as pages and JSON."""
+"""What `refu evaluate` does: the paper's tables and figures, ours beside the paper's, as pages and JSON."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from refu_lab.commands.evaluate import EvaluateOptions
 from refu_lab.tables import RESULT_TABLES
 
 _TIMED = 40
-"""Test samples of a garment that times are measured on."""
+"""Number of a garment's test samples that times are measured on."""
 
 
 def _command(options: EvaluateOptions, table: str) -> str:
-    """The command that makes a table again, with the names of folders alone."""
+    """The command that makes a table again, with folder names in place of full paths."""
     parts = ["refu evaluate", f"--table {table}"]
     if table == "motion":
         parts += ["--motions motions/"]
@@ -37,10 +37,10 @@ def _command(options: EvaluateOptions, table: str) -> str:
 def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None = None) -> list[rp.ResultTable]:
     """Makes and writes the tables that were asked for.
 
-    Methods are run by `engine`, a block of samples a task; the tables sdf, time and motion by this process alone.
+    `engine` runs the methods, a block of samples a task; this process alone makes the tables sdf, time and motion.
 
     Raises:
-        RefuError: there is nothing to make them of, a data set or motion can't be read, or the results can't be
+        RefuError: there is nothing to make them from, a data set or motion can't be read, or the results can't be
         written.
     """
     if not options.data and (options.table not in ("all", "motion") or options.motions is None):
@@ -75,7 +75,7 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         rp.run_methods(study, samples, methods, engine=engine, **how)
     for name in wanted:
         n_samples = n_posed
-        if name == "sequence":  # of several numbers of body shapes in one study, as each has methods of its own
+        if name == "sequence":  # one study for all numbers of body shapes, as each has its own methods
             in_motion = rp.Study()
             for samples in moving:
                 own = [f"mlp-{samples.shapes}{refu}" for refu in ("", "-refu-approx")]
@@ -89,7 +89,7 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
             table = rp.posture_table(study)
         elif name == "sdf":
             table = rp.sdf_table(posed, **how)
-        elif name == "time":  # with nothing else in the same run
+        elif name == "time":  # in a run of its own
             timed = rp.Study()
             with one_thread():
                 for samples in posed:
@@ -118,7 +118,7 @@ def _check_sets(sets: Sequence[rp.SampleSet]) -> None:
 
 
 def results_text(tables: Sequence[rp.ResultTable], output: Path) -> str:
-    """What `refu evaluate` prints: every table in short, and where the pages are."""
+    """What `refu evaluate` prints: a short form of every table, and where the pages are."""
     parts = []
     for table in tables:
         parts += [grid.text() for grid in table.in_short()]
@@ -139,7 +139,7 @@ def read_clips(folder: Path) -> dict[str, adapters.Motion]:
     """A folder's AMASS-style motions, by name.
 
     Raises:
-        RefuError: there is none, or one can't be read.
+        RefuError: there is no motion, or one can't be read.
     """
     paths = sorted(folder.glob("*.npz"))
     if not paths:

@@ -1,4 +1,4 @@
-"""Dressed persons as files of other programs: GLB, OBJ and USD, with the garments' texture coordinates."""
+"""Dressed persons as files for other programs: GLB, OBJ and USD, with the garments' texture coordinates."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from refu_lab.commands.replay import RecordingOptions
 
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
-"""Suffixes of what is written."""
+"""Suffixes of the files that can be written."""
 _USD = (".usda", ".usdc", ".usd")
 _FAR = 100.0
-"""From here on float32 has steps of 8 µm and more [m]."""
+"""Farther than this from the origin, float32 has steps of 8 µm and more [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class ExportMesh:
 
     name: str
     vertices: NDArray[np.float64]
-    """SMPL axes (y up, z forward), which are those of glTF [m], shape (T, V, 3)."""
+    """In SMPL axes (y up, z forward), which glTF shares [m], shape (T, V, 3)."""
     faces: NDArray[np.int64]
     """Counter-clockwise from outside, shape (F, 3)."""
     color: tuple[float, float, float]
@@ -51,7 +51,7 @@ class ExportMesh:
 def meshes_of(
     pipeline: GarmentPipeline, outputs: Sequence[PipelineOutput], *, with_body: bool = True
 ) -> list[ExportMesh]:
-    """The body and the garments of T outputs of a pipeline, which are of one person; the translation is added."""
+    """The body and the garments in T pipeline outputs of one person, with the translation added."""
     found = []
     if with_body:
         bodies = np.stack([output.body + output.transl for output in outputs])
@@ -63,17 +63,17 @@ def meshes_of(
 
 
 def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps: float = 30.0) -> list[Path]:
-    """Writes meshes of T frames: one USD stage that moves, or a GLB or OBJ file a frame, numbered if there are several.
+    """Writes meshes of T frames: one animated USD stage, or a GLB or OBJ file a frame, numbered if there are several.
 
-    OBJ and USD keep the order of vertices, and texture coordinates apart from them. GLB has one of each: vertices on
-    the seams of a texture are there twice. GLB and USD have numbers of seven digits: more than `_FAR` from the origin,
-    meshes are stored about where they are first, and moved there by their node.
+    OBJ and USD keep the vertex order and store texture coordinates separately. GLB has one texture coordinate a vertex,
+    so vertices on texture seams are there twice. GLB and USD have numbers of seven digits: meshes farther than `_FAR`
+    from the origin are stored relative to their first place, and their node moves them there.
 
     Returns:
         The files.
 
     Raises:
-        RefuError: another suffix, no frame, a package that is missing, or a file that can't be written.
+        RefuError: another suffix, no frame, a missing package, or a file that can't be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -105,17 +105,17 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
 def export(
     options: RecordingOptions, path: Path, *, first: int, count: int, with_body: bool
 ) -> tuple[list[Path], list[str]]:
-    """What `refu export` does: some frames of a bag or motion file, dressed, as files; and what there is to warn of.
+    """What `refu export` does: writes some frames of a bag or motion file, dressed; returns the files and the warnings.
 
-    Frames are numbered as they were recorded; those that can't be read are left out, and said. Whatever the input's
-    axes are, y is up in the files.
+    Frames are numbered as they were recorded; those that can't be read are left out, and a warning says so. Whatever
+    the input's axes are, y is up in the files.
 
     Raises:
         RefuError: as `write_meshes`; options that make no pipeline, an input that can't be read, or no frame.
     """
     from refu_lab.sources import open_source
 
-    if path.suffix.lower() not in FORMATS:  # said before the work is done
+    if path.suffix.lower() not in FORMATS:  # raises before the work is done
         write_meshes((), path)
     load = cache(options.load_pipeline)
     source = open_source(options, lambda: load().body)
@@ -124,7 +124,7 @@ def export(
     frames, outputs, left_out, n_records = [], [], list[str](), 0
     for number, record in enumerate(islice(source.records, first + count)):
         n_records = number + 1
-        if number < first:  # what comes of the rest depends on it: the past, and where keypoints were
+        if number < first:  # later frames depend on it: their past, and where keypoints were
             with suppress(RefuError):
                 source.frame_of(record)
             continue
@@ -158,7 +158,7 @@ def _glb(meshes: Sequence[ExportMesh], frame: int, origin: NDArray[np.float64]) 
     for mesh in meshes:
         vertices, faces, coordinates = mesh.vertices[frame] - origin, mesh.faces, None
         if mesh.uv is not None:
-            # A vertex for each pair of place and texture coordinates.
+            # A vertex for each pair of position and texture coordinate.
             pairs = np.stack((mesh.faces, mesh.uv.faces), -1).reshape(-1, 2)
             unique, local = np.unique(pairs, axis=0, return_inverse=True)
             vertices, coordinates = vertices[unique[:, 0]], mesh.uv.coordinates[unique[:, 1]]
@@ -245,6 +245,6 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
 
 
 def _identifier(name: str) -> str:
-    """A name as USD wants it: letters, digits and underscores."""
+    """A name as USD requires it: letters, digits and underscores."""
     found = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
     return found if not found[:1].isdigit() else f"_{found}"

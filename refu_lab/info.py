@@ -17,13 +17,13 @@ from refu_lab.sources import fit_facts
 
 
 def describe_body(source: str) -> dict[str, Any]:
-    """What a body model file holds, whether it can be used, and how well garments will. Raises `BodyError`."""
+    """What a body model file holds, whether garments can be worn on it, and how well. Raises `BodyError`."""
     body = load_body(source)
     try:
         Connectivity.of(body.faces).require_closed()
         closed = "yes"
     except MeshError:
-        closed = "no"  # why not is said below
+        closed = "no"  # the reason is given below
     low, high = body.v_template[:, 1].min(), body.v_template[:, 1].max()
     facts: dict[str, Any] = {
         "body": source,
@@ -42,7 +42,7 @@ def describe_body(source: str) -> dict[str, Any]:
 
 
 def describe_garment(name: str) -> str:
-    """What the file of a garment that has a name holds, or why it can't be loaded."""
+    """What a named garment's file holds, or why it can't be loaded."""
     try:
         found = load_garment(name)
         networks = networks_of(name)
@@ -52,7 +52,7 @@ def describe_garment(name: str) -> str:
 
 
 def networks_of(garment: str) -> str:
-    """What the shipped networks of a garment are made of; raises `WeightsError` where their card is damaged."""
+    """What the shipped networks of a garment were trained from; raises `WeightsError` if their card is damaged."""
     stem = weights_folder(garment) / "tailornet-hybrid"
     if not stem.with_suffix(".json").exists():
         return "no networks: worn by skinning"
@@ -63,7 +63,7 @@ def networks_of(garment: str) -> str:
 
 
 def collect() -> dict[str, Any]:
-    """Versions, bodies, garments, modes and devices; plain values, ready for JSON."""
+    """Versions, bodies, garments, modes and devices as plain values, ready for JSON."""
     import torch
 
     cuda = (

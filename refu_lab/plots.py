@@ -1,4 +1,4 @@
-"""Plots of one look, without a display."""
+"""Plots in one style, made without a display."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COLOURS = ("#3b6ea5", "#e0a030", "#4a9a6a", "#b5493f", "#7a5fa0")
 def new_axes(
     rows: int = 1, columns: int = 1, *, size: tuple[float, float], **options: Any
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of this size [inches] and its axes, row by row; `options` are those of `Figure.subplots`."""
+    """A figure of the given size [inches] and its axes, row by row; `options` are those of `Figure.subplots`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -32,7 +32,7 @@ def new_axes(
 
 
 def save_svg(figure: Figure, path: Path) -> None:
-    """As a file that is the same for the same figures: no date, no random names."""
+    """Writes a figure; equal figures give equal files, without date or random names."""
     import matplotlib as mpl
 
     with mpl.rc_context({"svg.hashsalt": path.name}):

@@ -6,8 +6,8 @@ body = RenderMesh(vertices, faces)                               # SMPL axes: y 
 image = render([body], camera=Viewpoint.framing(vertices, yaw=25.0))  # uint8, (640, 480, 3)
 ```
 
-Soft daylight from a warm sun disc and a cool sky. How much of either a vertex sees is found once per vertex and
-interpolated, so a picture has no grain and every ray through a pixel is cheap; one thread draws 480 x 640 pixels of
+Soft daylight comes from a warm sun disc and a cool sky. How much of each a vertex sees is computed once per vertex and
+interpolated, so a picture has no grain and every ray through a pixel is cheap. One thread draws 480 x 640 pixels of
 a body and a garment in about two seconds. The same input gives the same picture.
 """
 
@@ -37,16 +37,16 @@ COLLIDING = (0.90, 0.10, 0.10)
 
 _SUN_RAYS, _SKY_RAYS = 40, 96
 _SUN_SPREAD = 0.012  # 1 - cos of the disc's half angle: 9 degrees, an overcast sun
-_SKY_REACH = 0.8  # [m] what is farther off doesn't dim the sky
-_COVERED = 0.3  # share of the sky under which a vertex counts as covered
+_SKY_REACH = 0.8  # [m] anything farther off doesn't dim the sky
+_COVERED = 0.3  # a vertex that sees less of the sky than this share counts as covered
 _GROUND_STEP, _GROUND_CELLS = 0.022, 400
-"""How finely light on the ground is found [m]: a foot's shadow ends at its sole; and how many steps a side at most."""
+"""Grid of light on the ground: its step [m], so fine that a foot's shadow ends at its sole, and most steps a side."""
 _CREASE = math.cos(math.radians(55.0))
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A pinhole camera in the world of the meshes, upright."""
+    """An upright pinhole camera in the world of the meshes."""
 
     eye: tuple[float, float, float]
     """Position [m]."""
@@ -67,7 +67,7 @@ class Viewpoint:
     ) -> Viewpoint:
         """A camera `distance` metres from `target` [m], shape (3,), in front (+z) of it.
 
-        It has gone round towards the subject's left (+x) by `yaw`, and looks down by `pitch` [degrees].
+        It is turned around the subject towards its left (+x) by `yaw`, and looks down by `pitch` [degrees].
         """
         a, b = math.radians(yaw), math.radians(pitch)
         away = np.array([math.sin(a) * math.cos(b), math.sin(b), math.cos(a) * math.cos(b)])
@@ -86,16 +86,16 @@ class Viewpoint:
         margin: float = 1.12,
         vertical_fov: float = 26.0,
     ) -> Viewpoint:
-        """A camera that sees all `vertices` [m], shape (V, 3), as large as a picture of `size` (width, height) lets it.
+        """A camera that shows all `vertices` [m], shape (V, 3), as large as a picture of `size` (width, height) allows.
 
-        `margin` is the free room around them, `yaw` and `pitch` are those of `looking_at`.
+        `margin` leaves free room around them (1 is none); `yaw` and `pitch` are those of `looking_at`.
         """
         points = np.asarray(vertices, dtype=np.float64).reshape(-1, 3)
         camera = cls.looking_at((points.min(0) + points.max(0)) / 2, distance=1.0, yaw=yaw, pitch=pitch)
         right, up, forward = camera.axes()
         half = math.tan(math.radians(vertical_fov) / 2)
         centre = np.asarray(camera.target)
-        for _ in range(3):  # centring moves the limits a little through perspective
+        for _ in range(3):  # because of perspective, centring changes the limits a little
             x, y, depth = ((points - centre) @ axis for axis in (right, up, forward))
             reach = np.maximum(np.abs(y), np.abs(x) * size[1] / size[0]) * margin / half - depth
             distance = float(reach.max())
@@ -104,7 +104,7 @@ class Viewpoint:
         return cls.looking_at(centre, distance=distance, yaw=yaw, pitch=pitch, vertical_fov=vertical_fov)
 
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Unit vectors to the right, up and forward of the picture, each of shape (3,)."""
+        """Unit vectors to the right and up in the picture and forward into it, each of shape (3,)."""
         forward = _unit(np.asarray(self.target, dtype=np.float64) - np.asarray(self.eye, dtype=np.float64))
         right = _unit(np.cross(forward, (0.0, 1.0, 0.0)))
         return right, np.cross(right, forward), forward
@@ -132,7 +132,7 @@ def collision_mesh(
 
 
 def colliding_vertices(faces: NDArray[np.int64], found: Collisions) -> NDArray[np.bool_]:
-    """Vertices of a garment that are inside the body, or of a triangle that collides, shape (V,)."""
+    """Mask of a garment's vertices that are inside the body or belong to a colliding triangle, shape (V,)."""
     colliding: NDArray[np.bool_] = found.inside.copy()
     colliding[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = True
     return colliding
@@ -147,14 +147,14 @@ class Backdrop:
     ground: tuple[float, float, float] = (0.90, 0.90, 0.90)
     """sRGB of the ground in full light; it fades into the background with distance."""
     sun: float = 0.95
-    """How bright the sun is, of 1; less sky and more sun make harder light."""
+    """Brightness of the sun, up to 1; less sky and more sun make harder light."""
     sky: float = 1.0
-    """How bright the sky is, of 1."""
+    """Brightness of the sky, up to 1."""
     ground_height: float | None = None
-    """Height y of the ground [m]; None for right under the lowest vertex."""
+    """Height y of the ground [m]; None puts it right under the lowest vertex."""
     show_ground: bool = True
     to_sun: tuple[float, float, float] = (-0.45, 0.85, 0.65)
-    """Direction to the sun; needs no unit length."""
+    """Direction to the sun, of any length."""
 
 
 def render(
@@ -165,9 +165,10 @@ def render(
     samples: int = 9,
     backdrop: Backdrop | None = None,
 ) -> NDArray[np.uint8]:
-    """Draws meshes, one at least, and returns sRGB, uint8, shape (height, width, 3).
+    """Draws at least one mesh and returns sRGB, uint8, shape (height, width, 3).
 
-    `size` is width and height [pixels], `samples` rays a pixel, rounded down to a square: more make smoother outlines.
+    `size` is width and height [pixels]. `samples` is the rays a pixel, rounded down to a square number: more make
+    smoother outlines.
     """
     import warp as wp
 
@@ -185,7 +186,7 @@ def render(
     on_vertices = [_array(_uncovered(x, sky < _COVERED, faces), wp.float32) for x in (sun, sky)]
     low, high = vertices.min(0), vertices.max(0)
     ground_y = float(low[1]) if backdrop.ground_height is None else backdrop.ground_height
-    # The grid reaches as far as the shadow does; beyond it the ground lies in full light.
+    # The grid reaches as far as the shadow does; beyond it the ground is in full light.
     shadow = np.abs(to_sun[[0, 2]] / max(to_sun[1], 0.2)) * max(float(high[1]) - ground_y, 0.0)
     grid_low = low[[0, 2]] - shadow - _SKY_REACH / 2
     extent = float((high[[0, 2]] + shadow + _SKY_REACH / 2 - grid_low).max())
@@ -235,9 +236,10 @@ def render(
 
 
 def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> list[NDArray[np.float32]]:
-    """The share of the sky that vertices see past all meshes, of each mesh (V,); meshes are vertices (V, 3) [m], faces.
+    """The share of the sky that the vertices of each mesh see past all meshes, (V,) a mesh.
 
-    Under cloth, it is that of the uncovered neighbours, as in a picture.
+    Each mesh is its vertices (V, 3) [m] and faces. Covered vertices take the share of their uncovered neighbours, as in
+    a picture.
     """
     import warp as wp
 
@@ -249,7 +251,7 @@ def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -
 
 
 def save_png(image: NDArray[np.uint8], path: str | os.PathLike[str]) -> None:
-    """Writes a picture, shape (height, width, 3), as PNG, whole or not; OSError when the file can't be written."""
+    """Writes a picture, shape (height, width, 3), as PNG, in full or not at all; `OSError` when it can't be written."""
     from PIL import Image
 
     with replacing(Path(path)) as file:
@@ -283,7 +285,7 @@ def _light(
     *,
     sun_rays: int = _SUN_RAYS,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What N points (N, 3) of these normals see of the sun and of the sky past a Warp mesh, each of shape (N,)."""
+    """Shares of the sun and the sky that N points (N, 3) of these normals see past a Warp mesh, each of shape (N,)."""
     import warp as wp
 
     from refu_lab._ray_kernels import light_kernel
@@ -313,9 +315,9 @@ def _normals(
 
 
 def _uncovered(light: NDArray[np.float32], covered: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Light of the vertices, shape (V,), where those that cloth covers take that of their uncovered neighbours.
+    """Light of the vertices, shape (V,), where `covered` ones take the mean of their uncovered neighbours.
 
-    Or the darkness under a hem would spread beyond it, into every face that the hem crosses.
+    Otherwise the darkness under a hem would spread beyond it, into every face that the hem crosses.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     result = light.astype(np.float64)

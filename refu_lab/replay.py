@@ -32,22 +32,22 @@ from refu_lab.sources import body_facts, open_source
 from refu_lab.truth import GroundTruth
 
 When = Literal["before", "after"]
-"""Collision handling."""
+"""Before or after collision handling."""
 _MAX_REASONS = 20
-"""Reasons of skips that are counted apart."""
+"""Most reasons for skipping that are counted separately."""
 _LONGEST_PAUSE_S = 60.0
 _TOLD_S = 0.2
 
 
 class Findings(NamedTuple):
-    """What exact checks find in a frame: of one garment, or of all."""
+    """What exact checks find in a frame, of one garment or of all together."""
 
     n_inside: int
-    """Vertices in the body."""
+    """Vertices inside the body."""
     n_pairs: int
-    """Triangles that cut it."""
+    """Pairs of a garment's and the body's triangles that intersect."""
     max_depth: float
-    """[m]."""
+    """Depth of the deepest vertex [m]."""
 
 
 @dataclass(frozen=True)
@@ -70,14 +70,14 @@ class FrameResult:
     garments: Mapping[str, GarmentRecord]
 
     def total(self, when: When) -> Findings:
-        """Of all garments."""
+        """The findings of all garments together."""
         found: list[Findings] = [getattr(one, when) for one in self.garments.values()]
         deepest = max((one.max_depth for one in found), default=0.0)
         return Findings(sum(one.n_inside for one in found), sum(one.n_pairs for one in found), deepest)
 
     @property
     def badness(self) -> tuple[int, float, int, float]:
-        """Orders frames from best to worst: what is left first, what there was to do second."""
+        """Orders frames from best to worst: first by the collisions that are left, then by those there were before."""
         before, after = self.total("before"), self.total("after")
         return after.n_inside + after.n_pairs, after.max_depth, before.n_pairs, before.max_depth
 
@@ -90,23 +90,23 @@ class ReplayResult:
     source: str
     """What was read: a topic and its type, or a motion file."""
     frames: list[FrameResult] = field(default_factory=list)
-    """Those that were evaluated."""
+    """The frames that were evaluated."""
     latencies_ms: array[float] = field(default_factory=lambda: array("d"))
-    """Of each frame, from input bytes to output bytes."""
+    """Latency of each frame, from input bytes to output bytes."""
     shift_sum: float = 0.0
-    """How far the collider is from the skin: the sum over frames of the mean of all vertices' ways [m]."""
+    """How far the collider is from the skin: the mean shift of all vertices, summed over the frames [m]."""
     shift_largest: float = 0.0
-    """The longest way of a vertex [m]."""
+    """The largest shift of any vertex [m]."""
     skips: Counter[str] = field(default_factory=Counter)
     """Messages that were not replayed, by reason."""
     warnings: list[str] = field(default_factory=list)
     before: dict[str, Figures] = field(default_factory=dict)
     after: dict[str, Figures] = field(default_factory=dict)
     on_skin: dict[str, Figures] = field(default_factory=dict)
-    """As `after`, held against the skin in place of the collider."""
+    """As `after`, but measured against the skin instead of the collider."""
     interrupted: bool = False
     body: dict[str, Any] = field(default_factory=dict)
-    """Who wore the garments, and how well the built-in mesh lies on that body."""
+    """The body that wore the garments, and how well the built-in mesh fits it (`body_facts`)."""
 
     def add(
         self,
@@ -115,7 +115,7 @@ class ReplayResult:
         latency_ms: float,
         garments: Mapping[str, GarmentRecord] | None,
     ) -> None:
-        """Takes in a frame, and what was found of its `garments` where it was evaluated."""
+        """Takes in a frame and, where it was evaluated, what was found of its `garments`."""
         shift = output.stats.shift
         self.latencies_ms.append(latency_ms)
         self.shift_sum += shift.mean
@@ -129,13 +129,13 @@ class ReplayResult:
         self.skips[reason if known else "other reasons"] += 1
 
     def latency_ms(self, garment: str | None = None) -> dict[str, float]:
-        """Percentiles of the latency of a garment (the frame without the others' own stages), or of the frame [ms]."""
+        """Percentiles of the latency of the frame or of a garment (the frame less the others' own stages) [ms]."""
         values = self.latencies_ms if garment is None else [f.garments[garment].latency_ms for f in self.frames]
         p50, p95, p99 = np.percentile(values, (50, 95, 99)) if len(values) else (0.0, 0.0, 0.0)
         return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
 
     def skin_shift_mm(self) -> dict[str, float]:
-        """How far the collider is from the skin, over all frames: the mean of all vertices' ways, the longest [mm]."""
+        """How far the collider is from the skin: mean and largest shift over all vertices of all frames [mm]."""
         mean = 1e3 * self.shift_sum / max(1, len(self.latencies_ms))
         return {"mean": mean, "largest": 1e3 * self.shift_largest}
 
@@ -216,10 +216,10 @@ def replay(
     progress: bool = False,
     told: Callable[[int, int], object] | None = None,
 ) -> ReplayResult:
-    """Runs every frame of the input through the pipeline, writes the output bag, measures.
+    """Runs every frame of the input through the pipeline, writes the output bag, and measures.
 
-    `pipeline` is what `options.load_pipeline()` has given, if that was called already. `progress` shows a bar. `told`
-    is called some times a second with how many frames are done, and of how many: 0 where that isn't known.
+    `pipeline` is the result of `options.load_pipeline()`, if that was called already. `progress` shows a bar. `told` is
+    called a few times a second with how many frames are done, and of how many (0 where that isn't known).
 
     An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
 
@@ -231,10 +231,10 @@ def replay(
         require_apart(options.input, options.output)
     load = cache(lambda: pipeline or options.load_pipeline())
     with ExitStack() as stack:
-        source = open_source(options, lambda: load().body)  # whose faults are told at once
+        source = open_source(options, lambda: load().body)  # before the pipeline: a bad input is reported at once
         options = replace(options, frame_id=options.frame_id or source.frame_id)
         pipeline = load()
-        # Kernels are compiled, or the first frame would be late; in a pose that nobody sends, or it would be known.
+        # Compiles the kernels, so that the first frame isn't late; in a pose nobody sends, so none counts as known.
         pipeline(SmplFrame(pose=np.full((24, 3), 1e-3, np.float32)))
         result = ReplayResult(options, source.description, body=body_facts(pipeline))
         if options.backbone == BackboneName.AUTO:
@@ -259,7 +259,7 @@ def replay(
                     output = pipeline(frame)
                     garments = [mesh.local for mesh in output.values()]
                     data = encoder.encode(garments, stamp_ns=frame.stamp_ns, transl=frame.transl)
-                except RefuError as error:  # no body, a body that nobody has, or what can't be written
+                except RefuError as error:  # no body, an impossible one, or a result that can't be encoded
                     result.skip(str(error))
                     if bag is not None:
                         bag.add_skip(record, str(error))
@@ -273,7 +273,7 @@ def replay(
             result.interrupted = True
         if evaluator is not None:
             evaluator.summarise(result)
-        result.warnings += source.warnings(pipeline, betas_are_told=bool(truth.garments))  # of the built-in bodies
+        result.warnings += source.warnings(pipeline, betas_are_told=bool(truth.garments))  # truth is on built-in bodies
     if not result.latencies_ms and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         reasons = reasons or "; ".join(() if source.bag is None else source.bag.reader.warnings)
@@ -295,7 +295,7 @@ def _counted(records: Iterable[FrameRecord], total: int, told: Callable[[int, in
 
 
 def _paced(records: Iterable[FrameRecord], speed: Literal["max", "real"]) -> Iterator[FrameRecord]:
-    """The records, as fast as they are taken or at the pace of their log times, without pauses above a minute."""
+    """The records, as fast as they are taken or at the pace of their log times; pauses above a minute are skipped."""
     origin: tuple[float, int] | None = None
     for record in records:
         if speed == "real":

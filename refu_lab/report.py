@@ -1,4 +1,4 @@
-"""The HTML report of a replay: the worst, a median and the best frame to be turned, and all frames in curves."""
+"""The HTML report of a replay: the worst, a median and the best frame in 3D, and curves over all frames."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
     """Writes `index.html` and its plots and pictures into `folder`, which is made if it isn't there.
 
     Returns:
-        The path of the page. It refers to files of its own folder only.
+        The path of the page, which refers only to files in its own folder.
 
     Raises:
         RefuError: the folder can't be written.
@@ -105,7 +105,7 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
 
 
 def _legend(axes: Axes, *, columns: int) -> None:
-    """Above the axes, where it covers no curve."""
+    """Puts the legend above the axes, where it covers no curve."""
     axes.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, fontsize=8, ncols=columns, frameon=False
     )
@@ -114,7 +114,7 @@ def _legend(axes: Axes, *, columns: int) -> None:
 def _draw_frames(
     result: ReplayResult, pipeline: GarmentPipeline, folder: Path, *, progress: bool
 ) -> tuple[list[Frame], str]:
-    """Renders the worst, a median and the best frame, before and after, from their parameters; and all as HTML."""
+    """Renders the worst, a median and the best frame, before and after; returns the frames and their HTML turntable."""
     order = sorted(range(len(result.frames)), key=lambda i: result.frames[i].badness)
     chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
     body_faces = pipeline.body.faces.cpu().numpy()
@@ -123,7 +123,7 @@ def _draw_frames(
     meshes += [Mesh(name, one.faces.cpu().numpy(), one.card.color) for name, one in pipeline.garments.items()]
     frames = []
     start = result.frames[0].frame.stamp_ns
-    # A frame has axes of its own (a camera's, or z up); the pictures have y up.
+    # Frames may come in axes of their own (a camera's, or z up); the pictures have y up.
     roots = np.array([one.frame.pose[0] for one in result.frames], np.float64)
     turn = (upright_turn(roots) if result.options.axes == "frame" else np.eye(3)).astype(np.float32)
     with tqdm(total=2 * len(chosen), desc="pictures", unit="picture", disable=None if progress else True) as bar:

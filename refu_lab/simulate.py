@@ -1,4 +1,4 @@
-"""What `refu simulate` does: a data set of simulated garments, with progress, and a summary of its card."""
+"""What `refu simulate` does: makes a data set of simulated garments, shows progress, and summarises its card."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from refu_lab.render import save_png
 from refu_lab.tables import format_table
 
 SHEET = "samples.png"
-"""Random samples of a finished set, to look at before anything is trained on it."""
+"""Picture of random samples of a finished set, to look at before anything is trained on it."""
 
 
 def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress: bool) -> dict[str, Any]:
     """Simulates with a progress bar that shows what was dropped; returns the set's card.
 
-    A finished set of samples gets its picture, `samples.png`.
+    A finished set of samples also gets a picture of some of them, `samples.png`.
 
     Raises `RefuError`.
     """

@@ -1,4 +1,4 @@
-"""Where a replay's frames come from: a bag of SMPL parameters or of keypoints, a file of motion; and on which body."""
+"""Where a replay's frames come from (a bag of SMPL parameters or keypoints, or a motion file), and who wears them."""
 
 from __future__ import annotations
 
@@ -43,33 +43,34 @@ class Source:
     topic: str
     message_type: str
     decode: Callable[[bytes, int], SmplFrame]
-    """A message's frame; it is told when the message was received [ns]."""
+    """Makes a frame of a message, given its bytes and the time that it was received [ns]."""
     records: Iterator[FrameRecord]
     count: int | None
-    """Records, where the file says how many there are."""
+    """Number of records, if the file says it."""
     bag: adapters.SmplBag | None = None
-    """What is read; None for a motion file."""
+    """The bag that is read; None for a motion file."""
     notes: Sequence[str] = ()
-    """What the reader of a motion file took for granted."""
+    """What the reader of a motion file assumed."""
     gender: str = "neutral"
-    """Whose motion it is, where the file says it."""
+    """Gender of the recorded person, where the file says it."""
     is_fitted: bool = False
     """Whether its betas were fitted to the body that wears the garments."""
     frame_id: str = WORLD_FRAME
-    """Of what comes of it."""
+    """The frame_id of the output."""
 
     track: adapters.Track = field(default_factory=adapters.Track)
-    """What a bag's frames say of how they are meant; files of motion are asked when they are read."""
+    """Finds what is doubtful in a bag's units, stamps and axes; motion files are checked when they are read."""
     history: PoseHistory | None = None
-    """Tells frames their past, for garments that heed it (`GarmentPipeline.heeds_past`)."""
+    """Adds its past to each frame, for garments that heed it (`GarmentPipeline.heeds_past`)."""
     has_betas: bool = False
-    """Whether there were shapes, and a style, in its frames."""
+    """Whether any frame so far had a shape."""
     has_style: bool = False
+    """Whether any frame so far had a style."""
 
     def frame_of(self, record: FrameRecord) -> SmplFrame:
-        """A record's frame, in the shape that was asked for.
+        """A record's frame, with the body shape that the options ask for.
 
-        Raises `DecodeError` for a record that has none, and `FrameError` for a body that nobody has.
+        Raises `DecodeError` for a record without a frame, and `FrameError` for an impossible body.
         """
         if record.error is not None:
             raise record.error
@@ -86,7 +87,7 @@ class Source:
         return frame if betas is None else replace(frame, betas=np.asarray(betas, np.float32))
 
     def warnings(self, pipeline: GarmentPipeline, *, betas_are_told: bool = False) -> list[str]:
-        """What there is to say of the file and of who wears what in it; complete after the last record."""
+        """Warnings about the input, the body and its garments; complete after the last record."""
         options, bag = self.options, self.bag
         is_told = betas_are_told or options.betas_are_told or pipeline.fit is not None
         is_told = is_told or self.is_fitted or options.input_type in adapters.KEYPOINT_TYPES
@@ -103,9 +104,9 @@ class Source:
 
 
 def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Source:
-    """Opens the input; `body` is who wears the garments, and isn't asked for where nothing depends on it.
+    """Opens the input; `body` gives who wears the garments, and is called only if something depends on it.
 
-    Raises `RefuError` for an input that can't be read, or with options that it has no use for.
+    Raises `RefuError` for an input that can't be read, or with options that don't apply to it.
     """
     if options.input.suffix.lower() in SUFFIXES:
         if options.topic is not None or options.input_type is not None:
@@ -117,7 +118,7 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
             fps=options.fps,
             axes=options.input_axes,
             person=options.person,
-            worn=Proportions.of_body(body()) if options.input.exists() else None,  # what isn't there is told at once
+            worn=Proportions.of_body(body()) if options.input.exists() else None,  # a missing file is reported at once
         )
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
         up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None
@@ -146,9 +147,9 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
 
 
 def _frame_of_first(bag: adapters.SmplBag) -> tuple[str, bool]:
-    """The frame that a bag's first message of people is in, and whether it is a body's own, of ROS4HRI.
+    """The frame_id of a bag's first message, and whether it is the frame of one body, as in ROS4HRI.
 
-    Empty where it says none, or can't be read.
+    It is empty where the message has none, or can't be read.
     """
     record = next(iter(bag), None)
     try:
@@ -178,7 +179,7 @@ def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord
 
 
 _Up = Callable[[bytes], "NDArray[np.float64] | None"]
-"""Which way is up in a message's axes, shape (3,); None for SMPL's."""
+"""Gives the up direction in a message's axes, shape (3,), or None for SMPL's axes."""
 
 
 def _decoding(decoder: adapters.Decoder, up_of_message: _Up) -> Callable[[bytes, int], SmplFrame]:
@@ -196,9 +197,9 @@ def _up_of(options: RecordingOptions, decoder: adapters.Decoder) -> _Up:
 
 
 def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Callable[[bytes, int], SmplFrame]:
-    """Decodes messages of keypoints to the frames of one person: `options.person`, or who comes first.
+    """Decodes keypoint messages to the frames of one person: `options.person`, or the first one to appear.
 
-    In `notes` it says who else is to be seen, if nobody was asked for.
+    If no person was asked for, `notes` says who else is there.
     """
     assert options.input_type is not None
     stream = adapters.InputStream(options.input_type)
@@ -225,7 +226,7 @@ def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Ca
 
 
 def body_facts(pipeline: GarmentPipeline) -> dict[str, Any]:
-    """Plain values, ready for JSON; of a body that was named, how far the built-in mesh is from its surface [mm]."""
+    """The body as plain values for JSON; for a named body, also how far the built-in mesh is from its surface [mm]."""
     facts: dict[str, Any] = {"name": pipeline.body.name, "fingerprint": pipeline.body.fingerprint}
     return facts if pipeline.fit is None else facts | fit_facts(pipeline.fit)
 
@@ -237,7 +238,7 @@ def fit_facts(fit: BodyFit) -> dict[str, float]:
 
 
 def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
-    """What there is to warn of, for a recording that says it is of a `gender`, or (empty) doesn't."""
+    """Warnings about the body, for a recording of the given `gender` (empty if the recording doesn't say it)."""
     warnings = pipeline.warnings
     known = _gender_of(pipeline.body.name)
     said = gender.strip().lower()
@@ -250,6 +251,6 @@ def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
 
 
 def _gender_of(body: str) -> str:
-    """Whose body it is by its name, as `SMPL_FEMALE` and `basicModel_f_lbs_10_207_0_v1.0.0` are; empty if unsaid."""
+    """A body's gender by its name, like `SMPL_FEMALE` or `basicModel_f_lbs_10_207_0_v1.0.0`; empty if it says none."""
     words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in GENDERS]
     return GENDERS[words[0]] if words else ""

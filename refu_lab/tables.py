@@ -21,25 +21,25 @@ RESULT_TABLES = (
     *("parts", "comparison", "ablation", "gcnn", "sequence", "alpha", "sdf", "time", "laplacian", "unseen", "energy"),
     *("postures", "motion"),
 )
-"""What `refu evaluate` makes, in the order of its summary; here, where a command line finds it without torch."""
+"""The tables of `refu evaluate`, in the order of its summary; here, so that the command line needs no torch."""
 
 
 @dataclass(frozen=True)
 class TextTable:
-    """Cells as they are read."""
+    """A table whose cells are text already."""
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
-    """What must be known to read it."""
+    """What a reader has to know."""
 
     def text(self) -> str:
-        """For a terminal, under its title."""
+        """The table for a terminal, under its title."""
         return f"{self.title}\n{format_table(self.header, self.rows)}"
 
     def markdown(self) -> str:
-        """For a page, without its title."""
+        """The table for a page, without its title."""
         rule = ["---", *["---:"] * (len(self.header) - 1)]
         lines = [f"| {' | '.join(row)} |" for row in (self.header, rule, *self.rows)]
         return "\n".join([*([self.note, ""] if self.note else []), *lines])
@@ -56,14 +56,14 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def html_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of cells that are HTML already."""
+    """A table whose cells are HTML already."""
     lines = [("th", header), *(("td", row) for row in rows)]
     body = "".join(f"<tr>{''.join(f'<{tag}>{cell}</{tag}>' for cell in cells)}</tr>" for tag, cells in lines)
     return f"<table>{body}</table>"
 
 
 REPLAY_TITLE = "Replay of "
-"""Begins the titles of replays' pages, and tells them from others."""
+"""Start of the titles of replay pages, by which they are recognised."""
 
 
 def html_page(title: str, body: str, *, style: str) -> str:
@@ -85,12 +85,12 @@ def picture_markdown(file: str, caption: str) -> str:
 
 
 def write_page(path: Path, parts: Sequence[str]) -> None:
-    """Writes the parts of a page, all of it or nothing. Raises `RefuError` where it can't be written."""
+    """Writes a page from its parts, in full or not at all. Raises `RefuError` if it can't be written."""
     _write(path, "\n\n".join(parts))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes plain values, all of them or nothing. Raises `RefuError` where the file can't be written."""
+    """Writes plain values, in full or not at all. Raises `RefuError` if the file can't be written."""
     _write(path, json.dumps(content, indent=1, allow_nan=False))
 
 
@@ -138,7 +138,7 @@ _FOLDS = ("folds_1", "folds_4", "folds_16", "folds_64")
 
 
 def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """A row a garment of a replay's JSON."""
+    """One row for each garment of a replay's JSON."""
     rows = []
     for name, after in garments.items():
         latency = [f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99")]

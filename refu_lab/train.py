@@ -36,18 +36,18 @@ from refu_lab.tables import format_table
 
 
 def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
-    """Trains; returns the card of what was trained last.
+    """Trains networks; returns the card of what was trained last.
 
-    A mode with ReFU starts from the backbone alone, which is trained first where the output folder has none; the gcnn
+    A mode with ReFU starts from the backbone alone, which is trained first if the output folder has none. The gcnn
     starts from scratch in every mode, as in the paper's supplement.
 
-    Raises `RefuError` for options that name nothing, for a folder that another run writes to, and where training does.
+    Raises `RefuError` for invalid options, for a folder that another run writes to, and whenever training does.
     """
     _check(options)
     dataset = GarmentDataset(options.data) if options.network == "sdf" else open_dataset(options.data)
     folder = options.folder
     folder.mkdir(parents=True, exist_ok=True)
-    if os.environ.get("RANK", "0") != "0":  # of a torchrun, whose first process holds the folder
+    if os.environ.get("RANK", "0") != "0":  # under torchrun, whose first process holds the lock
         return _train(options, dataset, progress=progress)
     busy = RefuError(f"{folder}: another training writes here; wait for it, or give another --output")
     with exclusive(folder / "lock", error=busy):
@@ -61,7 +61,7 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
     steps: dict[str, Any] = {} if options.steps is None else {"steps": options.steps}
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
-        assert isinstance(dataset, GarmentDataset)  # `train` has opened it as that
+        assert isinstance(dataset, GarmentDataset)  # `train` has opened it as one
         to_sdf = replace(SdfSettings.of(options.preset), seed=options.seed, **steps)
         return train_sdf(dataset, body, template, options.folder, settings=to_sdf, **common)
     common["body"] = body

@@ -1,6 +1,7 @@
 """Ground truth that a bag carries beside its body parameters: garments as markers on a topic of their own.
 
-And predictions beside it that their network hasn't seen: what σ is fitted to, and checked against.
+Also predictions for its frames, which the networks weren't trained on: σ is fitted to their errors and checked against
+them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from refu_core.history import PoseHistory
 from refu_core.outputs import RADIUS_90, SigmaMap, bend_of, fit_sigma
 
 TOPIC = "/ground_truth"
-"""A MarkerArray a frame, stamped as its body parameters are; a marker's `ns` is the garment's name.
+"""Topic of a MarkerArray a frame, with the stamp of its body parameters; a marker's `ns` is the garment's name.
 
 Its points are the garment's vertices (type POINTS), or the corners of its triangles (TRIANGLE_LIST).
 """
@@ -28,7 +29,7 @@ Its points are the garment's vertices (type POINTS), or the corners of its trian
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """True garments by name and stamp."""
+    """Ground-truth garments by name and stamp."""
 
     garments: Mapping[str, Mapping[int, NDArray[np.float64]]] = field(default_factory=dict)
     """Vertices in SMPL axes with the translation [m], shape (V, 3), by stamp [ns]."""
@@ -37,7 +38,7 @@ class GroundTruth:
     def of_bag(
         cls, path: Path, faces: Mapping[str, NDArray[np.int64]], *, axes: adapters.InputAxes = "smpl"
     ) -> GroundTruth:
-        """What the bag at `path` holds of the garments whose faces (F, 3) are given.
+        """The ground truth in the bag at `path` of the garments whose faces (F, 3) are given.
 
         Raises:
             AdapterError: the bag can't be read, or a garment in it has another topology.
@@ -56,7 +57,7 @@ class GroundTruth:
         return cls(garments)
 
     def of(self, garment: str, frame: SmplFrame) -> NDArray[np.float64] | None:
-        """The true garment without the translation [m], shape (V, 3); None where the bag has none at that stamp."""
+        """The true garment without the translation [m], shape (V, 3); None if the bag has none at the frame's stamp."""
         vertices = self.garments.get(garment, {}).get(frame.stamp_ns)
         return None if vertices is None else vertices - frame.transl
 
@@ -72,7 +73,7 @@ def _vertices(marker: adapters.Marker, faces: NDArray[np.int64]) -> NDArray[np.f
 
 
 def garments_of(bag: Path) -> list[str]:
-    """Names of the garments whose truth a bag holds, sorted. Raises `AdapterError` for a bag that can't be read."""
+    """Sorted names of the garments whose truth a bag holds. Raises `AdapterError` for a bag that can't be read."""
     with adapters.BagReader(bag) as reader:
         if TOPIC not in {topic.name for topic in reader.topics}:
             return []
@@ -80,7 +81,7 @@ def garments_of(bag: Path) -> list[str]:
 
 
 class TrueFrame(NamedTuple):
-    """One frame whose truth is known."""
+    """One frame with its ground truth."""
 
     frame: SmplFrame
     truth: NDArray[np.float64]
@@ -90,7 +91,7 @@ class TrueFrame(NamedTuple):
 
 
 def moments_of(bag: Path, garment: GarmentTemplate) -> list[TrueFrame]:
-    """The frames of a bag that have the garment's truth.
+    """The frames of a bag that come with the garment's truth.
 
     Raises:
         RefuError: the bag can't be read, or there is none of this garment.
@@ -125,10 +126,10 @@ class HeldOut(NamedTuple):
 
 
 def held_out(bag: Path, garment: str, *, every: int = 1, weights: Path | None = None) -> HeldOut:
-    """Predicts every so-many-th of the frames of a bag that have a garment's truth.
+    """Predicts a garment in one of `every` so many frames of a bag that come with its truth.
 
-    `weights` is a folder of one's own, in place of those that ship. Raises `RefuError` for a bag that can't be read or
-    has no truth of this garment, and where there is no such garment.
+    `weights` is a folder of your own weights, in place of those that ship. Raises `RefuError` for a bag that can't be
+    read or has no truth of this garment, and where there is no such garment.
     """
     pipeline = GarmentPipeline.load([garment], weights=weights)
     (template,) = pipeline.garments.values()
@@ -139,7 +140,7 @@ def held_out(bag: Path, garment: str, *, every: int = 1, weights: Path | None = 
 
 
 def coverage(found: SigmaMap, samples: HeldOut) -> float:
-    """Share of the true vertices that are within the 90 % interval."""
+    """Share of the true vertices within the 90 % interval."""
     held = [
         np.mean(errors <= RADIUS_90 * found.at(float(bend)))
         for errors, bend in zip(samples.errors, bend_of(samples.garment, samples.poses), strict=True)
@@ -148,7 +149,7 @@ def coverage(found: SigmaMap, samples: HeldOut) -> float:
 
 
 def cross_checked(samples: HeldOut) -> float:
-    """Share of true vertices within the 90 % interval: of each style-shape pair, with σ fitted to the others."""
+    """Share of the true vertices within the 90 % interval, for each style-shape pair with σ fitted to the others."""
     shares: list[float] = []
     for pair in np.unique(samples.pairs):
         is_out = samples.pairs == pair

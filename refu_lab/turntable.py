@@ -1,8 +1,9 @@
-"""Frames that are turned with the mouse, within a page of their own: no library, no network, no file beside it.
+"""3D frames to turn with the mouse, embedded in a page: no library, no network, no other file.
 
-Faces are there once for all frames. Places are a fine grid's, 0.15 mm wide for a person; what collision handling has
-made of them is the difference to what the network said, and all are differences to the number before, low bytes apart
-from high ones, as deflate likes it: a body in two garments, three frames before and after, is 0.65 MB of text.
+Faces are stored once for all frames. Positions are rounded to a fine grid, 0.15 mm wide for a person. Numbers are
+stored as differences from the previous one, positions after collision handling as differences from those before it.
+Low bytes are kept apart from high ones, which deflate compresses better: a body in two garments, three frames before
+and after, is 0.65 MB of text.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ STYLE = """
   #turntable canvas { background: radial-gradient(ellipse at 50% 40%, #4a4f57, #26292e); } }
 """
 _GRID = (1 << 14) - 1
-"""Steps of the grid along the longest side of all that a frame shows."""
+"""Grid steps along the longest side of a frame's bounding box."""
 _MOST = 1 << 15
-"""Vertices of a mesh: differences of their numbers are of 16 bits and a sign's place."""
+"""Most vertices of a mesh: differences of vertex indices have to fit 16 bits, sign included."""
 _SCRIPT = Path(__file__).with_suffix(".js")
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """One mesh of all frames."""
+    """What a mesh has in common in all frames."""
 
     name: str
     faces: NDArray[np.int64]
@@ -54,7 +55,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class MeshInFrame:
-    """A mesh in a frame."""
+    """A mesh's vertices in one frame."""
 
     vertices: NDArray[np.float32]
     """y up [m], shape (V, 3)."""
@@ -64,23 +65,23 @@ class MeshInFrame:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame, and what is said below it."""
+    """A frame and its captions."""
 
     name: str
     title: str
     before: Sequence[MeshInFrame]
-    """A pose a mesh, before collision handling; the first mesh is the body."""
+    """Each mesh before collision handling; the first is the body."""
     after: Sequence[MeshInFrame]
     before_caption: str
     after_caption: str
     yaw: float
-    """Of the camera at first, round from z towards x [degrees]."""
+    """The camera's first yaw, from z towards x [degrees]."""
 
 
 def turntable(meshes: Sequence[Mesh], frames: Sequence[Frame]) -> str:
-    """HTML of the element, its data and its script; `STYLE` belongs to the page.
+    """HTML of the element, its data and its script; the page itself has to include `STYLE`.
 
-    Raises `RefuError` for a mesh of more vertices than a page shows.
+    Raises `RefuError` for a mesh with more vertices than a page can show.
     """
     counts = [(len(frames[0].after[k].vertices), len(mesh.faces)) for k, mesh in enumerate(meshes)]
     for mesh, (n_vertices, _) in zip(meshes, counts, strict=True):
@@ -97,7 +98,7 @@ def turntable(meshes: Sequence[Mesh], frames: Sequence[Frame]) -> str:
         sides = [_quantised(meshes, poses, low, step) for poses in (frame.before, frame.after)]
         for before, after in zip(*sides, strict=True):
             blocks += [_signed(np.diff(before.places, axis=1, prepend=0)), _signed(after.places - before.places)]
-            blocks += [before.light.tobytes(), (after.light - before.light).tobytes()]  # modulo 256, as it is read
+            blocks += [before.light.tobytes(), (after.light - before.light).tobytes()]  # modulo 256, as in the script
             blocks += [np.packbits(side.red, bitorder="little").tobytes() for side in (before, after)]
         told.append(
             {
@@ -114,7 +115,7 @@ def turntable(meshes: Sequence[Mesh], frames: Sequence[Frame]) -> str:
         )
     data = zlib.compress(b"".join(blocks), 9)
     scene = {"frames": told, "colours": [mesh.color for mesh in meshes], "counts": counts}
-    text = json.dumps(scene).replace("<", "\\u003c")  # a name can't end the element that it is in
+    text = json.dumps(scene).replace("<", "\\u003c")  # so that no name can close the script element
     return f"""<div id="turntable"><canvas tabindex="0" role="img"
 aria-label="{html.escape(frames[0].title)}, to be turned with the mouse"></canvas><div></div><p class="note"></p></div>
 <script type="application/json" id="turntable-scene">{text}</script>
@@ -126,7 +127,7 @@ class _Quantised(NamedTuple):
     places: NDArray[np.int64]
     """On the grid, shape (3, V)."""
     light: NDArray[np.uint8]
-    """The sky that is seen, of 255, shape (V,)."""
+    """Share of the sky that is seen, 0 to 255, shape (V,)."""
     red: NDArray[np.bool_]
     """Shape (V,)."""
 
@@ -144,6 +145,6 @@ def _quantised(
 
 
 def _signed(numbers: NDArray[np.int64]) -> bytes:
-    """Numbers in ±32,767 with their signs last, so that small ones are small: all low bytes, then all high ones."""
+    """Numbers in ±32,767, signs in the lowest bit so that small ones stay small: all low bytes, then all high bytes."""
     folded = np.where(numbers < 0, -2 * numbers - 1, 2 * numbers).astype(np.uint16).reshape(-1)
     return (folded & 0xFF).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()

@@ -1,4 +1,4 @@
-"""A bag, dressed by `refu replay` in a process of its own: it may take what it takes, and can be ended at any time."""
+"""A bag that `refu replay` dresses in a process of its own: it may take its time, and can be ended at any time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _INTERRUPTED = 130
 
 
 class BagJob:
-    """Tells, in a thread of its own, how many frames are done, and of how many. `cancel` it from any thread.
+    """Dresses a bag; a thread calls `told` with the frames done and their total. `cancel` it from any thread.
 
     Raises `RefuError` where the process can't be started.
     """
@@ -49,7 +49,7 @@ class BagJob:
         try:
             self._process = subprocess.Popen(command, **pipes, start_new_session=True)
             os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
-        except ProcessLookupError:  # it has ended already: `wait` says why
+        except ProcessLookupError:  # it has ended already: `_wait` says why
             pass
         except OSError as error:
             msg = f"no bag can be replayed: {error}"
@@ -77,7 +77,7 @@ class BagJob:
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
 
     def cancel(self) -> None:
-        """Ends it; the bag is closed, with the frames that are done."""
+        """Ends the process; the bag is closed, with the frames that are done."""
         self._process.terminate()
         last = threading.Timer(_PATIENCE_S, self._process.kill)
         last.daemon = True

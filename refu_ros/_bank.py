@@ -1,4 +1,4 @@
-"""The node's publishers: those of all people live as long as the node, those of one come and go with them."""
+"""The node's publishers: those for all people live as long as the node, those for one person come and go with them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ QOS = adapters.QosProfile(reliability="reliable", depth=5)
 
 
 class Bank:
-    """Publishers of a lifecycle node. `hold` belongs to the executor's thread, what else there is to any.
+    """Publishers of a lifecycle node. Only the executor's thread may call `hold`; any may call the rest.
 
-    `on_match` is called when somebody subscribes, or does so no longer.
+    `on_match` is called when somebody subscribes or unsubscribes.
     """
 
     def __init__(self, node: Any, on_match: Callable[[], object]) -> None:
@@ -29,10 +29,10 @@ class Bank:
         self._refused: set[str] = set()
 
     def hold(self, wanted: Mapping[str, str], *, lasting: bool = False) -> None:
-        """Has publishers of these topics, by message type, and no others but those that were `lasting`.
+        """Keeps publishers of these topics, given with their types, and no others except those that are `lasting`.
 
-        Only those have overrides of their QoS: they are parameters, which never go. A type whose package isn't there is
-        left out, and said once; so is a topic whose name is too long, and is a fault.
+        Only lasting ones have QoS overrides: these are parameters, which are never removed. A type whose package is
+        missing is left out and logged once. A topic whose name is too long is left out and counts as a fault.
         """
         for topic, kind in wanted.items():
             if topic in self._publishers or kind in self._refused:
@@ -49,7 +49,7 @@ class Bank:
                 publisher = self._node.create_lifecycle_publisher(
                     message_class, topic, ros_qos(QOS), qos_overriding_options=options, event_callbacks=told
                 )
-            except NameValidationException as error:  # peers name people
+            except NameValidationException as error:  # people's names come from other nodes
                 self._node.fault("topics", error)
                 continue
             publisher.lasts = lasting
@@ -75,7 +75,7 @@ class Bank:
         return any(self.watchers(topic) for topic in [*self._publishers])
 
     def send(self, topic: str, data: bytes) -> None:
-        """Publishes, where the topic still is."""
+        """Publishes, if the topic still exists."""
         if (publisher := self._publishers.get(topic)) is not None:
             with contextlib.suppress(InvalidHandle):
                 publisher.publish(data)

@@ -1,4 +1,4 @@
-"""Beside the stream, in threads of their own: pipelines are loaded, and single frames dressed, as somebody asks."""
+"""Work beside the stream, in threads of its own: loading pipelines, and dressing single frames on request."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ if TYPE_CHECKING:
 Then = Callable[["PipelineOutput", dict[str, NDArray[np.float64]]], object]
 
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-"""A folder or file: nothing hidden, no `..`, no option of a command."""
+"""Name of a folder or file: not hidden, not `..`, not an option of a command."""
 _MOST_PARTS = 8
 _MOST_GARMENTS = 16
 _MOST_WAITING = 8
-"""Requests that may wait: who asks more often than frames can be dressed is told so."""
+"""Requests that may wait: anyone who asks faster than frames can be dressed is told so."""
 _MOST_PIPELINES = 2
 NICE = 10
-"""Who asks for a frame waits for those whose garments are to be there 30 times a second."""
+"""Niceness of work on request: garments that are due 30 times a second come first."""
 
 
 def load(options: PipelineOptions, *, threads: int = 1) -> GarmentPipeline:
-    """Loads a pipeline, which takes some tenths of a second, and asks it once for all that a subscriber may want.
+    """Loads a pipeline, which takes some tenths of a second, and computes once all that a subscriber may want.
 
-    Kernels are loaded when they first run, and the frames that come meanwhile would be lost. Raises `RefuError`.
+    Kernels are loaded when they first run; on the stream, frames that came meanwhile would be lost. Raises `RefuError`.
     """
     from refu_core.outputs import DressedPerson, Fittings  # loads torch
 
@@ -59,7 +59,7 @@ def load(options: PipelineOptions, *, threads: int = 1) -> GarmentPipeline:
 
 
 class PipelineLoader:
-    """A thread that loads the pipeline asked for last; requests it has been too slow for are forgotten."""
+    """A thread that loads the pipeline asked for last; earlier requests that it didn't get to are dropped."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class PipelineLoader:
 
 
 class RequestDresser:
-    """`ask` belongs to one thread. What it makes doesn't depend on who is on the node's topics, or was."""
+    """Dresses single frames, independently of what comes on the node's topics. `ask` belongs to one thread."""
 
     def __init__(self) -> None:
         self._pool: ThreadPoolExecutor | None = None
@@ -103,7 +103,7 @@ class RequestDresser:
         self._load = lru_cache(_MOST_PIPELINES)(load)
 
     def ask(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> Future[object]:
-        """What `then` makes of the output, and of each garment's vertices in the frame of the messages [m], (V, 3).
+        """A future of what `then` makes of the output and each garment's vertices in the messages' frame [m], (V, 3).
 
         Raises `RefuError` where too many wait.
         """
@@ -145,7 +145,7 @@ def _give_way() -> None:
 
 
 def asked_frame(request: Any) -> SmplFrame:
-    """Of a `refu_msgs/srv/Dress` request. Raises `FrameError` for what no body has."""
+    """The frame of a `refu_msgs/srv/Dress` request. Raises `FrameError` for numbers that no body has."""
     betas = np.asarray(request.betas, np.float32)
     stamp = request.header.stamp
     frame = SmplFrame(
@@ -160,16 +160,16 @@ def asked_frame(request: Any) -> SmplFrame:
 
 
 def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
-    """The settings with a request's garments and mode of collisions. Raises `RefuError` for some that make no sense.
+    """The settings with a request's garments and collision mode. Raises `RefuError` if they make no sense.
 
-    Garments are files: those that ship may be named, and what the operator has chosen, but no path.
+    Garments are files: a request may name those that ship and those the operator has chosen, but no path.
     """
     names, sdf = tuple(request.garments[:_MOST_GARMENTS]), request.sdf or settings.sdf
     known = list(dict.fromkeys([*settings.garments, *BUILTIN_GARMENTS]))
     if unknown := [name for name in names if name not in known] or request.garments[_MOST_GARMENTS:]:
         msg = f"garments: wanted up to {_MOST_GARMENTS} of {', '.join(known)}, got {unknown[0]!r}"
         raise RefuError(msg)
-    # A style is of the garments that the parameters name: others may have none.
+    # The style belongs to the garments in the parameters: others may have none.
     style = settings.style if names in ((), settings.garments) else (0.0,) * len(settings.style)
     asked = replace(settings, garments=names or settings.garments, sdf=sdf, style=style)
     asked.check_files()
@@ -177,7 +177,7 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
 
 
 def asked_path(settings: NodeSettings, name: str) -> Path:
-    """A path below the parameter `bags`. Raises `RefuError` for any other, links out of that folder included."""
+    """A path below the folder in the parameter `bags`. Raises `RefuError` for any other, links out of it included."""
     if not settings.bags:
         msg = "a request may name no file: start the node with the parameter bags, a folder for them"
         raise RefuError(msg)

@@ -19,41 +19,41 @@ _OVER_BUDGET = 0.1
 """Share of the frames that may be superseded before they are worked on."""
 _LOW_DISK_BYTES = 1 << 30
 _FIRST_INPUT_S = 2.0
-"""How long after the node has begun to listen nobody is missed yet [s]."""
+"""How long the node listens before it reports that somebody is missing [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Situation:
-    """What a report says nothing of."""
+    """What the diagnostics need to know besides the report."""
 
     node: str
-    """Its name with the namespace."""
+    """The node's name with its namespace."""
     state: str
-    """The lifecycle's."""
+    """The lifecycle's state."""
     persons: Sequence[str]
-    """Those in the scene."""
+    """The people in the scene."""
     recording: RecorderState | None
     recording_error: str
     listening_for: float | None = math.inf
     """Time since the inputs were subscribed to [s]; None where they aren't."""
     in_use: PipelineOptions | None = None
-    """What is computed with."""
+    """The options of the pipeline in use."""
     input_frame: str = ""
-    """The sender's, where it isn't the markers'."""
+    """The sender's frame, where it isn't the markers'."""
     is_transformed: bool = False
-    """Whether there are transforms of it."""
+    """Whether anybody sends transforms."""
     has_foreign_betas: bool = False
-    """Whether nobody knows what the betas mean that came."""
+    """Whether betas have come without anything saying whose shape space they belong to."""
     doubted: str = ""
     """What is doubted of the input."""
     has_no_clock: bool = False
-    """Whether time is a simulation's that hasn't begun."""
+    """Whether the clock is that of a simulation that hasn't begun."""
     n_namesakes: int = 0
-    """Other nodes of this name."""
+    """How many other nodes have this name."""
 
 
 def statuses(report: Report, settings: NodeSettings, now: Situation) -> list[DiagnosticStatus]:
-    """Node, input, output and recording."""
+    """The statuses of node, input, output and recording."""
     host = socket.gethostname()  # two robots' nodes of one name are told apart by it
     parts = {"node": _node, "input": _input, "garments": _output, "recording": _recording}
     found = []
@@ -65,11 +65,11 @@ def statuses(report: Report, settings: NodeSettings, now: Situation) -> list[Dia
 
 
 Judgement = tuple[list[tuple[object, int, str]], dict[str, str]]
-"""Level and message of what may hold, of which the first that does is said; and values."""
+"""Rules of condition, level and message, of which the first that holds is reported; and values."""
 
 
 def _node(report: Report, _: NodeSettings, now: Situation) -> Judgement:
-    """What went wrong though nobody's frame was the reason: requests without sense, clocks, callbacks."""
+    """What went wrong for reasons other than somebody's frame: senseless requests, clocks, callbacks."""
     faults = sum(n for key, n in report.recent.items() if key.startswith("fault."))
     last = report.reasons["fault"]
     values = {"state": now.state, "last fault": last}
@@ -86,7 +86,7 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
     recent, reasons, persons, silent_for = report.recent, report.reasons, now.persons, report.silent_for
     received, invalid, waited = recent["received"], recent["drop.invalid"], now.listening_for or 0.0
     missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
-    if settings.input_type == "keypoint_markers":  # who is in them is called `<person>_<namespace>`
+    if settings.input_type == "keypoint_markers":  # people in them are called `<person>_<namespace>`
         missing = [name for name in missing if not any(one.startswith(f"{name}_" if name else "") for one in persons)]
     who = ", ".join(filter(None, missing)) or f"{min(silent_for or 0.0, waited):.1f} s"
     silence = f"no input {'from' if any(missing) else 'for'} {who}"

@@ -1,4 +1,4 @@
-"""A node that no peer can end: what a callback raises is counted, logged, and over."""
+"""A node that no peer can end: what a callback raises is counted and logged, and the node goes on."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from refu_core.errors import printable
 
 _CLOCK = "/clock"
 _MOST_ITEMS = 1000
-"""Entries of a list in a request to rclpy's own services: it works through them one by one, and nobody else is served
-meanwhile."""
+"""The most entries of a list in a request to rclpy's own services: it works through them one by one, and serves nobody
+else meanwhile."""
 LOG_PERIOD_S = 5.0
-"""How often the log says one thing [s]."""
+"""Shortest time between two log messages of the same kind [s]."""
 
 
 class GuardedNode(Node):  # type: ignore[misc]
-    """Every callback that rclpy has made or is given here goes through `guarded`.
+    """A node whose callbacks, rclpy's own included, all go through `guarded`.
 
-    Executors end at the first exception, and the C++ one forgets requests that came with the one that failed, so that
-    a guard around the executor alone isn't enough.
+    Executors end at the first exception, and the C++ one forgets requests that came with the one that failed. So a
+    guard around the executor alone isn't enough.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
         self.statistics = Statistics()
         self._said: dict[str, float] = {}
         super().__init__(name, **options)
-        # rclpy's own never forgets what there was: topics of everybody who has come and gone.
+        # rclpy's own group never drops what is gone: topics of everybody who has come and left.
         group, there = self.default_callback_group, self.default_callback_group.entities
         group.add_entity = lambda entity: there.add(weakref.ref(entity, there.discard))
         for service in self.services:  # rclpy's own: parameters, lifecycle, type description
@@ -47,7 +47,7 @@ class GuardedNode(Node):  # type: ignore[misc]
             service.callback = self.guarded(what, _bounded(service.callback), answer_no)
 
     def fault(self, what: str, error: Exception) -> None:
-        """Counts and logs what has gone wrong in a callback, and not only there."""
+        """Counts and logs what has gone wrong, in a callback or elsewhere."""
         text, now = printable(f"{what}: {_reason(error)}"), time.monotonic()
         self.statistics.fault(what, text)
         if now > self._said.get(what, -math.inf) + LOG_PERIOD_S:  # one kind's flood doesn't hide another
@@ -57,7 +57,7 @@ class GuardedNode(Node):  # type: ignore[misc]
     def guarded(
         self, what: str, callback: Callable[..., Any], otherwise: Callable[..., Any] = lambda *_, **__: None
     ) -> Callable[..., Any]:
-        """The callback, and where it raises, what `otherwise` makes of the error and the callback's arguments."""
+        """The callback, made safe: if it raises, it returns what `otherwise` makes of the error and the arguments."""
 
         @functools.wraps(callback)
         def call(*arguments: Any, **options: Any) -> Any:
@@ -72,7 +72,7 @@ class GuardedNode(Node):  # type: ignore[misc]
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *arguments: Any, **options: Any
     ) -> Any:
-        """As rclpy's, also for the clock, which rclpy subscribes to itself."""
+        """Like rclpy's, but guarded; also for the clock, which rclpy subscribes to itself."""
 
         def checked(message: Any) -> None:
             # A time that no message can carry would raise wherever a stamp is made, in rclpy itself, too.
@@ -83,10 +83,10 @@ class GuardedNode(Node):  # type: ignore[misc]
         return super().create_subscription(msg_type, topic, taken, *arguments, **options)
 
     def add_waitable(self, waitable: Any) -> None:
-        """As rclpy's, for the events of publishers and subscriptions.
+        """Like rclpy's, but guarded, for actions and for the events of publishers and subscriptions.
 
-        An event may be queued when its publisher or subscription is destroyed: then there is nothing to take any more,
-        which the C++ executor would raise.
+        An event may still be queued when its publisher or subscription is destroyed. Then there is nothing left to
+        take, and the C++ executor would raise.
         """
         take = waitable.take_data
 
@@ -128,7 +128,7 @@ def _bounded(callback: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def answer_no(error: Exception, request: Any, response: Any) -> Any:
-    """The answer to a request that can't be met: as it is made, `success` is false; where it has room, the reason."""
+    """The answer to a request that can't be met: `success` is false by default; the reason goes where there is room."""
     refused = SetParametersResult(successful=False, reason=printable(_reason(error)))
     if hasattr(response, "message"):
         response.message = printable(_reason(error))

@@ -21,15 +21,15 @@ def interface(name: str) -> Any:
     try:
         found = getattr(import_module(f"{package}.{kind}"), type_name)
         check_for_type_support(found)
-    except (ImportError, AttributeError) as error:  # the latter: a folder of definitions, which Python takes for it
+    except (ImportError, AttributeError) as error:  # AttributeError: Python took a folder of definitions for it
         msg = f"{name} isn't importable: install or source {package} ({error})"
         raise RefuError(msg) from error
-    except Exception as error:  # of rosidl's own kind: to import its name is to import a parser of definitions
+    except Exception as error:  # rosidl's own class, whose import would load a parser of definitions
         msg = f"{name} is of no use: install or build {package} anew, for this ROS and Python ({error})"
         raise RefuError(msg) from error
     return found
 
 
 def ros_qos(profile: QosProfile) -> QoSProfile:
-    """The same as rclpy has it."""
+    """The same profile as rclpy's class."""
     return QoSProfile(depth=profile.depth, reliability=ReliabilityPolicy.get_from_short_key(profile.reliability))

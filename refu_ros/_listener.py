@@ -1,4 +1,4 @@
-"""What comes in: subscriptions while somebody wants what comes of them, and where each message's frame is."""
+"""The node's input: subscriptions that last while somebody wants the output, and where each message's frame is."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=5)
 _HUMANS = re.compile(r"/humans/bodies/([A-Za-z][A-Za-z0-9_]{0,99})/joint_states")
 _TRACKED = "/humans/bodies/tracked"
 _GRACE_S = 5.0
-"""How long the inputs stay subscribed to when nobody is left: many a viewer is only restarted [s]."""
+"""How long the inputs stay subscribed to after the last viewer has left: many viewers are only restarted [s]."""
 _TF_DEPTH = 100
 _FIRST_TF_S = 1.0
 """How long the first transform is waited for; then people are shown as if their frame were that of the messages [s]."""
 
 
 class Listener:
-    """All of it belongs to the executor's thread, but for what it counts."""
+    """Subscribes to the inputs and fills the scene, on the executor's thread; its counters are thread-safe."""
 
     def __init__(self, node: GarmentNode) -> None:
         self._node = node
@@ -50,11 +50,11 @@ class Listener:
         self.room = max(MOST_PEOPLE, len(node.settings.persons))
         """How many people may be here at once."""
         self.scene: Scene | None = None
-        """Where people go who have come; None while nobody is dressed."""
+        """Where the frames of people go; None while nobody is dressed."""
         self.since: float | None = None
         """When the inputs were subscribed to, on the steady clock [s]; None while they aren't."""
         self.input_frame = ""
-        """The sender's, where it isn't that of the messages."""
+        """The sender's frame, where it isn't that of the messages."""
         self._wanted_at = 0.0
         self._inputs: dict[str, Any] = {}
         self._frames: dict[str, str] = {}
@@ -74,14 +74,14 @@ class Listener:
         return self.stream.is_of_keypoints and self._settings.keypoint_rate > 0
 
     def follow(self, body: SmplBody) -> None:
-        """Other settings, or another body; keypoints are of somebody with its proportions."""
+        """Takes over other settings or another body; keypoints are taken to be of somebody with its proportions."""
         settings = self._settings
         betas, smoothing = settings.known_betas, settings.keypoint_smoothing
         self.stream.follow(body, settings.keypoints, betas=betas, smoothing=smoothing)
 
     @property
     def doubted(self) -> str:
-        """What is doubted of who is here, or of topics that several send on; empty if nothing is."""
+        """Doubts about the people who are here, or about topics with several senders; empty if there are none."""
         here = () if self.scene is None else self.scene.persons
         found = [text for person in here if (text := self.doubts.of_senders.get(person))]
         for name, subscription in self._inputs.items():
@@ -96,7 +96,7 @@ class Listener:
         return [*dict.fromkeys([*named, *(self.scene.persons if self.scene is not None else ())])]
 
     def attend(self, *, is_wanted: bool) -> None:
-        """Listens while somebody wants what comes of it, and some seconds longer.
+        """Listens while somebody wants the output, and some seconds longer.
 
         Called whenever that may have changed, and once a second in case an event was missed.
         """
@@ -123,7 +123,7 @@ class Listener:
             self._hear("/camera", adapters.CAMERA_INFO, topic, self._on_camera, ros_qos(INPUT_QOS))
 
     def unsubscribe(self) -> None:
-        """Listens no longer."""
+        """Stops listening."""
         if self._inputs:
             self._node.get_logger().info("listening to nobody")
         for name, subscription in self._inputs.items():
@@ -136,7 +136,7 @@ class Listener:
     def _listen(self, person: str, topic: str) -> None:
         full_name = self._node.resolve_topic_name(topic)
         self._node.get_logger().info(f"listening to {full_name} ({self.stream.message_type})")
-        # Overrides are parameters, which never go: only topics that don't come and go have them.
+        # Overrides are parameters, which are never removed: only topics that don't come and go have them.
         overrides = None if self._settings.follow_humans else QoSOverridingOptions.with_default_policies()
         take = partial(self._on_input, person, full_name)
         self._hear(person, self.stream.message_type, topic, take, ros_qos(INPUT_QOS), qos_overriding_options=overrides)
@@ -144,7 +144,7 @@ class Listener:
     def _hear(
         self, name: str, kind: str, topic: str, take: Callable[[bytes], object], qos: QoSProfile, **options: Any
     ) -> None:
-        """Subscribes; what isn't a person's has a name that begins with a slash. Raises `RefuError`."""
+        """Subscribes; names that aren't a person's begin with a slash. Raises `RefuError`."""
         self._inputs[name] = self._node.create_subscription(interface(kind), topic, take, qos, raw=True, **options)
 
     def _on_input(self, person: str, topic: str, data: bytes) -> None:
@@ -162,7 +162,7 @@ class Listener:
             self._refuse(topic, error)
             return
         given = {name: printable(frame_id.lstrip("/")) for name, frame_id in frame_ids.items()}
-        # Keypoints' betas are measured on the body that is dressed, and their axes those of `frame_id`.
+        # Keypoints' betas are measured on the body that is dressed, and their axes are those of `frame_id`.
         for frame in () if self.stream.is_of_keypoints else frames.values():
             for doubt in self.doubts.of(person, frame, self._settings, is_y_up=self._settings.axes == "smpl"):
                 node.get_logger().warning(f"{topic}: {doubt}")
@@ -178,7 +178,7 @@ class Listener:
         self._node.get_logger().warning(f"{source}: {printable(error)}", throttle_duration_sec=LOG_PERIOD_S)
 
     def predict(self) -> None:
-        """Everybody whose keypoints are followed, by now."""
+        """Puts predicted frames of everybody whose keypoints are followed into the scene."""
         if self.scene is not None and self._node.is_watched():
             for name, frame in self.stream.predicted(self._node.now_ns()).items():
                 self._put(name, frame, f"predicted {name}")
@@ -206,7 +206,7 @@ class Listener:
     # Frames ---------------------------------------------------------------------------------------
 
     def _placement(self, given: str, stamp_ns: int) -> Placement | None:
-        """From a frame to that of the messages; None where they are one, or nobody sends transforms.
+        """The placement from a frame to that of the messages; None if they are the same, or nobody sends transforms.
 
         Raises `TransformError` where there are transforms, but none of this frame at this time.
         """
@@ -226,7 +226,7 @@ class Listener:
         return found
 
     def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
-        """The camera, where it was as this person was seen; None where there is none, or no transform of it."""
+        """The camera where it was when this person was seen; None if there is none, or no transform of it."""
         if (camera := self._camera) is None or not self._node.count_publishers(self._settings.camera_info):
             return None
         try:
@@ -256,7 +256,7 @@ class Listener:
             self._node.get_logger().warning(f"{text}: set frame_id to the sender's frame if they are the same place")
 
     def _need_transforms(self, who: str, given: str) -> bool:
-        """Asks for transforms as soon as a frame isn't that of the messages; whether it isn't."""
+        """Subscribes to transforms once a frame isn't that of the messages; returns whether it differs."""
         target = self._settings.frame_id
         differs = given not in ("", target)
         if differs and self._tf_asked_at is None and not self._is_refused:
@@ -282,7 +282,7 @@ class Listener:
     # Humans (REP-155) -----------------------------------------------------------------------------
 
     def _bodies(self) -> dict[str, str]:
-        """The topic of each body that there is: those that somebody says are tracked, else all."""
+        """The topic of each body that there is: of those announced as tracked, or of all if nothing is announced."""
         names, count, tracked = self._node.get_topic_names_and_types(), self._node.count_publishers, self._tracked
         found = ((match[1], topic) for topic, _ in names if (match := _HUMANS.fullmatch(topic)))
         bodies = [one for one in found if (tracked is None or one[0] in tracked) and count(one[1])]
@@ -296,11 +296,11 @@ class Listener:
             self._tracked = {*adapters.decode_ids(data)}
             self._follow_humans()
 
-        with suppress(RefuError):  # without its type, whoever has a topic is there
+        with suppress(RefuError):  # without this message type, everybody with a topic counts as there
             self._hear(_TRACKED, adapters.IDS_LIST, _TRACKED, take, QoSProfile(depth=1))
 
     def _follow_humans(self) -> None:
-        """Listens to bodies that have come and no longer to those that have gone."""
+        """Listens to bodies that have come, and no longer to those that have gone."""
         bodies = self._bodies()
         for person in [person for person in self._inputs if not person.startswith("/") and person not in bodies]:
             self._node.destroy_subscription(self._inputs.pop(person))

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 NODE_NAME = "garment_node"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 _BEAT_S = 1.0
-"""How often the node says how it is, and looks for whoever came or left unheard."""
+"""How often the node reports how it is, and looks for people who came or left unnoticed [s]."""
 _LAST_WORDS_S = 0.3
-"""Time for the answer to a shutdown request to leave."""
+"""Time for the answer to a shutdown request to be sent [s]."""
 
 
 class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
@@ -49,9 +49,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
         self.ends_at = math.inf
-        """When there is nothing left to do, on the steady clock [s]: it was told to end, or can't go on."""
+        """When the node ends, on the steady clock [s], because it was told to or can't go on."""
         self.failed = False
-        """Whether it ended because its device did."""
+        """Whether the node ended because its device failed."""
         self.settings = declare(self, NodeSettings)
         self.recording = RunningRecording(self.get_logger(), sync_period=self.settings.record_sync_period)
         self._state = "unconfigured"
@@ -65,7 +65,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._listener = Listener(self)
         self._outputs = make_outputs(tf=self.settings.publish_tf)
         self._bank = Bank(self, self._attend)
-        # These live as long as the node: who looks stays connected while it is configured anew.
+        # These live as long as the node: viewers stay connected while it is configured anew.
         lasting = {topic: one.message_type for one in self._outputs for topic in one.topics((), None)}
         self._bank.hold(lasting, lasting=True)
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
@@ -103,10 +103,10 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     @transition
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Dresses who sends, as soon as somebody wants that."""
+        """Dresses everybody who sends, as soon as somebody wants that."""
         assert self._pipeline is not None
         if self.settings.record:
-            self.recording.try_start(self.settings.record)  # where it can't: no reason to leave people undressed
+            self.recording.try_start(self.settings.record)  # if it can't, people are dressed all the same
         result = super().on_activate(state)
         scene = self._listener.scene = Scene(self.statistics, most=self._listener.room)
         from refu_ros._worker import Worker  # loads torch
@@ -117,7 +117,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._state = "active"
         self._hold_topics()
         try:
-            self._listener.subscribe()  # in any case: what is wrong with the inputs has to show at the start
+            self._listener.subscribe()  # even if nobody listens: wrong inputs have to show at the start
         except Exception as error:
             self.get_logger().error(f"can't be activated: {printable(error)}")
             self.on_deactivate(state)
@@ -139,14 +139,14 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     @transition
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Everything that is queued gets into the file before this returns. The node ends: it was told to."""
+        """Ends the node; everything that is queued gets into the file before this returns."""
         self.close()
         self._state = "finalized"
         self.ends_at = time.monotonic() + _LAST_WORDS_S
         return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """After a transition that raised: begins anew."""
+        """Begins anew after a transition that raised."""
         self.guarded("on_error", self.close)()
         return super().on_error(state)
 
@@ -173,7 +173,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._state = "unconfigured"
 
     def _attend(self) -> None:
-        """On the executor's thread: whether anybody wants anything may have changed."""
+        """To be called on the executor's thread when somebody may have begun or ceased to want the output."""
         if self._state == "active":
             self._listener.attend(is_wanted=self.is_watched())
 
@@ -184,7 +184,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         return self.recording.running or self._bank.is_watched()
 
     def watchers(self, topic: str) -> int:
-        """How many listen to a topic; a recording is one of garments."""
+        """How many listen to a topic; a recording counts as a listener to garments."""
         return self._bank.watchers(topic) + (topic == GARMENTS and self.recording.running)
 
     def now_ns(self) -> int:
@@ -202,7 +202,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self.get_logger().info("the first garments are out")
 
     def _hold_topics(self) -> None:
-        """Has the publishers of everybody who may come, in what they wear."""
+        """Keeps the publishers for everybody who may come, in what they wear."""
         assert self._worker is not None
         persons, fittings = self._listener.persons, self._worker.fittings
         self._bank.hold({topic: one.message_type for one in self._outputs for topic in one.topics(persons, fittings)})
@@ -233,7 +233,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             return SetParametersResult(successful=True)
         try:
             settings = self.settings.changed(values)
-            # What is asked for again is done again, where it has failed or was ended meanwhile.
+            # A repeated request is carried out again, if it has failed or was ended meanwhile.
             known = self.settings.pipeline == self._in_use == settings.pipeline
             if reload := not known and not values.keys().isdisjoint(PIPELINE_OPTIONS):
                 settings.pipeline.check_files()
@@ -275,7 +275,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._refused = key
 
     def _take_back(self) -> None:
-        """Has the parameters say again what is computed with, where what they say can't be loaded."""
+        """Sets the parameters back to the pipeline in use, if the one they ask for can't be loaded."""
         refused, self._refused = self._refused, None
         if refused is not None and self._in_use is not None and refused == self.settings.pipeline:
             used = {name: getattr(self._in_use, name) for name in PIPELINE_OPTIONS}
@@ -283,9 +283,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self.set_parameters([parameter(name, value) for name, value in changed.items()])
 
     def record(self, *, on: bool, path: str = "") -> tuple[str, str]:
-        """Starts or stops a recording, by default to the parameter's path: what has been done, and the bag.
+        """Starts or stops a recording, by default to the parameter's path; returns what has been done, and the bag.
 
-        Raises `RefuError` where that can't be.
+        Raises `RefuError` where it can't.
         """
         if on and self._state != "active":
             msg = f"the node is {self._state}: activate it first"
@@ -331,7 +331,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.recording.put(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY, data, QOS)
 
     def _count_namesakes(self) -> int:
-        """Other nodes of this name: they answer each other's parameters and services, and mix on their topics."""
+        """How many other nodes have this name: they answer each other's requests, and their topics mix."""
         own = (self.get_name(), self.get_namespace())
         count = max(0, list(self.get_node_names_and_namespaces()).count(own) - 1)
         if count:

@@ -1,4 +1,4 @@
-"""Settings as ROS parameters: declared with what they are for, and read as ROS has them."""
+"""Settings as ROS parameters: declared with their descriptions, and converted from ROS values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Settings = TypeVar("Settings")
 
 
 def listing(kind: type) -> str:
-    """The parameters, a line each."""
+    """The parameters, one per line."""
     specs = specs_of(kind).items()
     return "\n".join(
         ["parameters:", *(f"  {name:<20}{one.description} Default: {one.default!r}" for name, one in specs)]
@@ -21,7 +21,7 @@ def listing(kind: type) -> str:
 
 
 def declare(node: Any, kind: type[Settings]) -> Settings:
-    """Declares every parameter, and takes what the node was started with. What it doesn't know is warned of.
+    """Declares every parameter, returns what the node was started with, and warns of unknown parameters.
 
     Raises `SettingsError` for values that have no meaning, and rclpy's own errors for values of a wrong type.
     """
@@ -29,7 +29,7 @@ def declare(node: Any, kind: type[Settings]) -> Settings:
     for name, spec in specs_of(kind).items():
         default = list(spec.default) if isinstance(spec.default, tuple) else spec.default
         values[name] = node.declare_parameter(name, default, _descriptor(spec)).value
-    # A file of parameters may be for several nodes (`/**`), so it is no error.
+    # A file of parameters may be for several nodes (`/**`), so an unknown one is no error.
     for name in getattr(node, "_parameter_overrides", {}):
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             like = get_close_matches(name, values, n=1)
@@ -67,11 +67,11 @@ _TYPES: dict[type, tuple[str, Any]] = {
     float: ("a number", (int, float)),
     str: ("a string", str),
 }
-"""What is wanted of each type of parameter, and the types of values that are that."""
+"""For each type of parameter, what is wanted in words, and the types of values that are accepted."""
 
 
 def coerced(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of ROS as settings have them: tuples for lists, floats for whole numbers; those alone that are of `kind`.
+    """ROS values as settings have them: tuples for lists, floats for whole numbers. Names not in `kind` are dropped.
 
     Raises `SettingsError` for a value of another type.
     """
@@ -89,7 +89,7 @@ def _coerced(name: str, value: Any, spec: Spec) -> Any:
             items = [None]
     if not all(_is_of(kind, item) for item in items):
         hint = "an empty list" if kind is str else "whole numbers and decimals mixed; write all as decimals"
-        hint = f": no value, or {hint}" if value is None and is_list else ""  # what becomes of these on their way
+        hint = f": no value, or {hint}" if value is None and is_list else ""  # ROS turns these into None
         msg = f"{name}: wanted {wanted}, got {value!r}{hint}"
         raise SettingsError(msg)
     return tuple(map(kind, items)) if is_list else kind(value)

@@ -24,7 +24,7 @@ def run(
     listing: Callable[[], str],
     live: Callable[[], int],
 ) -> int:
-    """Answers --help with a `listing` of parameters and topics, or starts rclpy and lives; returns the exit status."""
+    """Answers --help with a `listing` of parameters and topics, or starts rclpy and runs `live`; returns the status."""
     _on_signals(signal.SIG_DFL)  # while it loads, nothing is open that would have to be closed
     try:
         import rclpy
@@ -49,7 +49,7 @@ def run(
         return _refuse(program, str(error))
     finally:
         rclpy.try_shutdown()
-        _on_signals(signal.SIG_IGN)  # the second Ctrl-C of who was in a hurry: the status is that of the first
+        _on_signals(signal.SIG_IGN)  # an impatient second Ctrl-C mustn't change the exit status
 
 
 def _refuse(program: str, text: str) -> int:
@@ -58,21 +58,21 @@ def _refuse(program: str, text: str) -> int:
 
 
 def _on_signals(handler: Any) -> None:
-    """SIGHUP comes of a terminal that is lost; `nohup` has it ignored, and so it stays."""
+    """Sets the handler of signals that end a program. SIGHUP (a lost terminal) stays ignored under `nohup`."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, handler)
 
 
 def hear(told: list[bool]) -> None:
-    """From now on `told` gets any of these signals: no Event, as one handler may interrupt the other in its lock."""
+    """Has these signals append to `told` from now on: an Event could deadlock, as handlers interrupt each other."""
     _on_signals(lambda *_: told.append(True))
 
 
 def make_executor() -> Any:
-    """What waits for messages, requests and timers."""
+    """An executor, which waits for messages, requests and timers."""
     try:
-        # Waits in C++ for events: the other one tells the middleware anew, in Python, what it waits for after each.
+        # This one waits for events in C++; the other one, after each event, rebuilds in Python what it waits for.
         from rclpy.experimental import EventsExecutor as Executor
     except ImportError:  # an older rclpy
         from rclpy.executors import SingleThreadedExecutor as Executor

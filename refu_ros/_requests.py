@@ -1,6 +1,6 @@
-"""What may be asked of the node: a recording and, where the package `refu_msgs` is, a frame or a bag, dressed.
+"""Requests to the node: for a recording and, where the package `refu_msgs` is installed, for a dressed frame or bag.
 
-Who asks may mean harm.
+Requests aren't trusted.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from refu_ros._node import GarmentNode
 
 _KEPT_S = 60
-"""For how long a bag's result may be asked for, by who lost the connection meanwhile [s]."""
+"""How long a bag's result is kept for a client that lost the connection meanwhile [s]."""
 
 
 class Requests:
-    """All of it belongs to the executor's thread; work is done in others, and answered from there."""
+    """The node's services and action, on the executor's thread; other threads do the work and send the answers."""
 
     def __init__(self, node: GarmentNode) -> None:
         self._node = node
@@ -60,7 +60,7 @@ class Requests:
             ActionServer(node, self._replay, "~/replay_bag", self._on_replay, **taken)
 
     def close(self) -> None:
-        """Ends what is under way. More may be asked for afterwards."""
+        """Ends what is under way. Further requests may follow."""
         if self._job is not None:
             self._job.cancel()
             wait([self._job.done])
@@ -89,7 +89,7 @@ class Requests:
         return self._dresser.ask(frame, settings, partial(self._dressed, response))
 
     def _send(self, send: Callable[[Any, Any], object], answer: Any, header: Any) -> None:
-        """An answer that isn't there yet is sent from the thread that makes it; meanwhile the executor goes on."""
+        """Sends an answer; one that isn't ready is sent by the thread that makes it, while the executor goes on."""
 
         def refused(error: Exception) -> Any:
             return answer_no(error, None, self._answer())

@@ -21,7 +21,7 @@ AXES = ("smpl", "frame")
 
 @dataclass(frozen=True, kw_only=True)
 class NodeSettings(DressOptions):
-    """All parameters; each field is one, of the same name.
+    """The node's parameters: each field is the parameter of the same name.
 
     Raises `SettingsError` for a value out of range and for values that can't go together.
     """
@@ -121,7 +121,7 @@ class NodeSettings(DressOptions):
 
     @property
     def lifetime_ns(self) -> int:
-        """Of the markers [ns]: as asked, but never so short that somebody who is here would flicker."""
+        """Lifetime of the markers [ns]: as set, but never so short that somebody who is here would flicker."""
         if not self.marker_lifetime:
             return 0
         slowest = 1 / self.max_rate if self.max_rate else 0.0
@@ -138,5 +138,5 @@ class NodeSettings(DressOptions):
 def _names_a_folder(path: str) -> bool:
     try:
         return "\0" not in path and Path(path).expanduser().absolute().name != ""
-    except RuntimeError:  # the home of a user that there isn't
+    except RuntimeError:  # the home of a user who doesn't exist
         return False

@@ -1,8 +1,8 @@
 """Room for meshes in the shared memory that Fast DDS sends through.
 
-Its half a megabyte holds less than one message of garments. A subscriber that stands still (a debugger, a viewer that
-swaps) keeps what it hasn't read, at most the 512 pieces of 64 kB that its queue holds. Once that fills the segment,
-nobody else gets anything either, often not even after the subscriber has gone. With 40 MB it can't be filled.
+Its default, half a megabyte, holds less than one message of garments. A subscriber that stands still (in a debugger, or
+swapping) occupies what it hasn't read, at most the 512 pieces of 64 kB that its queue holds. Once that fills the
+segment, nobody else gets anything either, often not even after the subscriber has gone. 40 MB can't be filled.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ _VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE",
 def make_room() -> bool:
     """Tells Fast DDS to use `fastdds.xml`, in this process, before `rclpy.init`; returns whether it was told.
 
-    Who has configured Fast DDS in any of its ways keeps what they have chosen, and where the memory isn't there (a
-    container with little of it) everything stays as Fast DDS has it. Other middleware doesn't read the variable.
+    If the user has configured Fast DDS in any of its ways, that stays. If there is too little shared memory (as in some
+    containers), Fast DDS keeps its defaults. Other middleware doesn't read the variable.
     """
     chosen = any(os.environ.get(name) for name in _VARIABLES) or Path("DEFAULT_FASTRTPS_PROFILES.xml").exists()
     with suppress(OSError):  # there is no such memory

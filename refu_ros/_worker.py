@@ -43,7 +43,7 @@ class _Known(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """A frame each of some persons, from when they were taken until they are sent."""
+    """One frame of each of some persons, from when they are taken until their garments are sent."""
 
     turn: int
     settings: NodeSettings
@@ -52,7 +52,7 @@ class _Batch:
     arrivals: Mapping[str, Arrival]
     frames: Mapping[str, SmplFrame]
     known: Mapping[str, _Known]
-    """Of those for whom nothing has changed but their place."""
+    """Results of those for whom nothing has changed but their position."""
     gone: list[str]
 
     def inputs(self, frame: SmplFrame) -> tuple[object, ...]:
@@ -64,15 +64,15 @@ class _Batch:
 
 
 def _there(arrival: Arrival, settings: NodeSettings) -> Placement:
-    """From the axes of the sender's roots to those of the messages."""
+    """The placement from the axes of the sender's roots to those of the messages."""
     return arrival.placement.after(Placement(ros_from_sender(settings.axes)))
 
 
 class Worker:
     """Takes the newest frames from the scene and sends garments, in threads of its own.
 
-    While one thread computes, another one takes what has come since, as many as the pipeline has `threads`. They send
-    in the order in which they took, so nobody sees a frame after a later one. `settings` may be replaced at any time; a
+    While one thread computes, others take what has come since, up to the pipeline's `threads` at once. They send in the
+    order in which they took frames, so nobody sees a frame after a later one. `settings` may be replaced at any time; a
     tick sees one version of it. `outlet` is the node, to which messages go.
     """
 
@@ -99,9 +99,9 @@ class Worker:
         self._stopping = threading.Event()
         self._last = -1e9
         self._taking = threading.Lock()
-        """Of what is decided when frames are taken."""
+        """Guards what is decided when frames are taken."""
         self._in_order = threading.Condition()
-        """Of what is done in the order of turns: sending, and what is known of who was sent."""
+        """Guards what is done in the order of turns: sending, and what is known of the people sent."""
         self._n_taken = self._n_done = 0
         self._threads = [threading.Thread(target=self._run, name=f"inference {i}") for i in range(settings.threads)]
 
@@ -111,7 +111,7 @@ class Worker:
             thread.start()
 
     def stop(self) -> None:
-        """Ends the threads after the ticks under way and clears the scene of viewers."""
+        """Ends the threads after the ticks under way, and removes everybody from viewers' scenes."""
         self._stopping.set()
         self._scene.wake()
         for thread in self._threads:
@@ -120,7 +120,7 @@ class Worker:
         self._remove([*self._here])
 
     def use(self, pipeline: GarmentPipeline) -> None:
-        """Another pipeline from the next tick on."""
+        """Uses another pipeline from the next tick on."""
         self._next = self._fitted(pipeline)
 
     @property
@@ -163,7 +163,7 @@ class Worker:
             outputs = self._infer(
                 batch.pipeline, {person: frame for person, frame in batch.frames.items() if person not in batch.known}
             )
-        finally:  # a turn that nobody takes would be waited for
+        finally:  # the others would wait forever for a turn that is left out
             with self._in_order:
                 self._in_order.wait_for(lambda: self._n_done == batch.turn)
                 try:
@@ -205,7 +205,7 @@ class Worker:
         return batch
 
     def _told(self, frame: SmplFrame, person: str, there: Placement) -> SmplFrame:
-        """A frame with its past, as it was where messages are: what a moving camera sees move stands still there."""
+        """A frame with its past in the messages' frame, where what moves only for a moving camera stands still."""
         body = self._pipeline.body
         pelvis = body.rest_joints(torch.tensor(frame.betas[None], device=body.device))[0, 0].cpu().double().numpy()
         pose = frame.pose.copy()
@@ -256,7 +256,7 @@ class Worker:
         return found, unresolved
 
     def _infer(self, pipeline: GarmentPipeline, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:
-        """All persons in one batch; where that fails, one by one, so that one's failure is nobody else's."""
+        """All persons in one batch; where that fails, one by one, so that one failure affects nobody else."""
         try:
             return dict(zip(frames, pipeline([*frames.values()]), strict=True)) if frames else {}
         except Exception as error:
@@ -277,7 +277,7 @@ class Worker:
             self._outlet.device_lost(str(error))
 
     def _send(self, batch: _Batch, frames: Mapping[str, SmplFrame]) -> None:
-        """What anybody wants to know of these people."""
+        """Sends what anybody wants to know of these people."""
         if batch.fittings is not self._sent_with:
             self._sent_with = batch.fittings
             for row in self._outputs:

@@ -44,7 +44,7 @@ def _listing() -> str:
 
 
 def _live() -> int:
-    """The node from its beginning to its end. Raises what is wrong with its parameters."""
+    """Runs the node to its end and returns the exit status. Raises if its parameters are wrong."""
     from refu_ros._node import GarmentNode
 
     node, told = GarmentNode(), list[bool]()
@@ -60,7 +60,7 @@ def _live() -> int:
 
 
 def started(node: Any, before_it_is_active: Callable[[], object] = lambda: None) -> bool:
-    """Configures and activates; what was wrong has been logged."""
+    """Configures and activates the node; returns whether that worked. Errors have been logged."""
     from rclpy.lifecycle import TransitionCallbackReturn
 
     done = TransitionCallbackReturn.SUCCESS

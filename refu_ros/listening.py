@@ -1,4 +1,4 @@
-"""Messages of a running node for programs that are no nodes themselves: raw bytes, in a thread of their own."""
+"""Messages of a running node for programs that aren't nodes themselves: raw bytes, in a thread of their own."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class LiveTopics:
         self.close()
 
     def close(self) -> None:
-        """Hears no more."""
+        """Stops listening."""
         self._executor.shutdown()
         self._thread.join()
         self._node.destroy_node()

@@ -37,9 +37,9 @@ from refu_core.body import JOINT_NAMES, PARENTS
 from refu_lab._ray_kernels import light_kernel
 
 PEOPLE = 600
-"""Drawn of either gender."""
+"""How many are drawn of each gender."""
 COARSER, LONGEST = 1.215, 0.0235
-"""Edges of the body relative to those of the base mesh, and at most [m]: gives 7,000 vertices."""
+"""Edge lengths of the body relative to the base mesh's, and their maximum [m]: gives 7,000 vertices."""
 JOINT_RIDGE = 5e-6
 """Keeps the joint regressor's weights small [m²]."""
 INFLUENCES = 4
@@ -56,7 +56,7 @@ class Topology:
     from_base: scipy.sparse.csr_matrix
     """Body vertices from base vertices, shape (V, n)."""
     mirror: NDArray[np.int64]
-    """The vertex that is a vertex's mirror image, shape (V,)."""
+    """The mirror image of each vertex, shape (V,)."""
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def build_topology(mesh: BaseMesh, spaces: list[ShapeSpace], *, reference: Vertices) -> Topology:
-    """Closes mouth and eyes, remeshes the left half coarser, mirrors it, and irons out what intersects itself."""
+    """Closes mouth and eyes, remeshes the left half coarser, mirrors it, and irons out self-intersections."""
     close, faces = close_cavities(mesh, reference)
     closed = close @ reference
     # A fan's centre belongs to the midline when its loop does.
@@ -147,7 +147,7 @@ def close_cavities(mesh: BaseMesh, reference: Vertices) -> tuple[scipy.sparse.cs
     surface = trimesh.Trimesh(v, faces, process=False)
     hidden = _openness(v, faces) < 0.35
     hidden &= (mesh.weights[:BODY_VERTICES, _HEAD] > 0.5)[faces].all(1)
-    # As symmetric as the mesh.
+    # The selection is to be as symmetric as the mesh.
     key = {tuple(sorted(face)): i for i, face in enumerate(faces)}
     image = np.array([key.get(tuple(sorted(face)), -1) for face in mesh.mirror[faces]])
     hidden &= (image >= 0) & hidden[image]
@@ -192,7 +192,7 @@ def fit_joints(topology: Topology, space: ShapeSpace, weights: NDArray[np.float6
         if name.startswith("right_"):
             continue
         near = _candidates(mean, moves[0, j], weights[:, [j, max(PARENTS[j], 0)]].sum(1))
-        # 33 equations in metres and one in units; the least weights that solve them nearly are all small.
+        # 33 equations in metres and one without a unit; the smallest weights that nearly solve them are all small.
         system = np.vstack([mean[near].T - moves[0, j][:, None], basis[near].reshape(len(near), -1).T])
         system = np.vstack([system, np.ones(len(near))])
         wanted = np.concatenate([np.zeros(3), moves[1:, j].T.ravel(), [1.0]])
@@ -207,7 +207,7 @@ def fit_joints(topology: Topology, space: ShapeSpace, weights: NDArray[np.float6
 
 
 def _candidates(points: Vertices, joint: NDArray[np.float64], affinity: NDArray[np.float64]) -> NDArray[np.int64]:
-    """About 200 vertices, evenly spread around a joint, of the limbs that it connects."""
+    """About 200 vertices, evenly spread around a joint, on the limbs that it connects."""
     distance = np.linalg.norm(points - joint, axis=1)
     limb = affinity > 0.3
     reach = 1.6 * np.sort(distance[limb])[40] + 0.03
@@ -221,7 +221,7 @@ def _candidates(points: Vertices, joint: NDArray[np.float64], affinity: NDArray[
 
 
 def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    # What ties with the first that has to go goes as well: left and right alike.
+    # Weights tied with the first one that is dropped are dropped, too: left and right stay alike.
     largest_left_out = -np.sort(-weights, axis=1)[:, INFLUENCES : INFLUENCES + 1]
     kept = np.where(weights > np.maximum(largest_left_out + 1e-9, 1e-3), weights, 0.0)
     few: NDArray[np.float64] = kept / kept.sum(1, keepdims=True)

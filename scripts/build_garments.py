@@ -59,7 +59,7 @@ class Garment:
     """Group of the base mesh that it is cut from."""
     cuts: tuple[Cut, ...]
     vertices: int
-    """Wanted size: that of the paper's garment."""
+    """Wanted number of vertices: that of the paper's garment."""
     ease: Field
     """Clearance from the body before smoothing [m], at points (P, 3)."""
     skin_smoothing: int
@@ -115,8 +115,8 @@ def skirt_flare(p: Vertices) -> NDArray[np.float64]:
 _TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14)
 """Joints between hips and neck."""
 _BELOW = (0, 1, 2, 3, 4, 5, 6, 9)
-"""What is worn below the waist feels how the trunk bends: without the spine, shorts were off by 11 mm in everyday
-postures, with it by 7."""
+"""Joints of what is worn below the waist, which feels how the trunk bends: without the spine, shorts were off by 11 mm
+in everyday postures, with it by 7."""
 _PROVENANCE = (
     "MakeHuman's clothes helpers, targets and skinning weights (CC0 1.0), cut and draped by scripts/build_garments.py, "
     "styles by scripts/build_styles.py; CC0 1.0"
@@ -259,7 +259,7 @@ def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -
     v, f = remesh(v, f, sizing=lambda p: np.full(len(p), length))
     from_source = attach(v, source, source_faces)
     draped = drape(v, f, garment, body)
-    # Draping has stretched the mesh: once more, for even edges and the right count.
+    # Draping has stretched the mesh: remesh it, for even edges and the right count.
     length *= np.sqrt(_area(draped, f) / _area(v, f))
     for _ in range(4):
         final, faces = remesh(draped, f, sizing=lambda p: np.full(len(p), length))  # noqa: B023
@@ -330,7 +330,7 @@ def keep_clear(v: Vertices, f: Faces, shapedirs: NDArray[np.float64], garment: G
                 lift = _larger(lift, most)
         if not np.linalg.norm(lift, axis=1).max() > 2e-5:
             break
-        # Shared with the neighbours, or cloth would show bumps.
+        # The neighbours share the lift; otherwise cloth would show bumps.
         v = v + _larger(lift, 0.8 * (smooth @ lift))
         for loop, cut in edges_on:
             v[loop] = cut.project(v[loop])
@@ -356,7 +356,7 @@ class BodyDistance:
         return np.maximum(clearance - distance, 0)[:, None] * gradient
 
     def push(self, points: Vertices, clearance: float | NDArray[np.float64]) -> Vertices:
-        """The points at the clearance at least."""
+        """The points, moved to at least the clearance."""
         return points + self.shortfall(points, clearance)
 
 
@@ -385,7 +385,7 @@ def _area(v: Vertices, f: Faces) -> float:
 
 
 def _edge_for(v: Vertices, f: Faces, vertices: int) -> float:
-    """Edge of equilateral triangles that cover the mesh with so many vertices [m]."""
+    """Edge length of equilateral triangles that cover the mesh with `vertices` vertices [m]."""
     return float(np.sqrt(_area(v, f) / (2 * vertices) * 4 / np.sqrt(3)))
 
 

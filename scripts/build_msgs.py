@@ -34,11 +34,11 @@ _FLAGS = ("-O0", "-fPIC", "-w")  # a message is copied here, not computed: -O2 t
 
 
 class BuildError(Exception):
-    """What a compiler has said."""
+    """A compiler has failed; the message is its output."""
 
 
 class MissingError(BuildError):
-    """A compiler, or rosidl."""
+    """A compiler or rosidl is missing."""
 
 
 def definitions() -> list[Path]:
@@ -47,7 +47,7 @@ def definitions() -> list[Path]:
 
 
 def key() -> str:
-    """Of what a build depends on: the definitions, this file, Python, and the generators."""
+    """A hash of what a build depends on: the definitions, this file, Python, and the generators."""
     parts = [path.read_bytes() for path in [*definitions(), Path(__file__)]]
     parts += [sys.version.encode(), sys.prefix.encode()]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
@@ -64,7 +64,7 @@ def build(folder: Path) -> None:
     with tempfile.TemporaryDirectory(prefix="build-", dir=folder) as temporary:
         code = Path(temporary)
         try:
-            with redirect_stdout(sys.stderr):  # they name each file
+            with redirect_stdout(sys.stderr):  # the generators print the name of each file
                 _generate(code, prefix / "share")
         except (ImportError, LookupError) as error:
             msg = f"rosidl is missing: source a ROS 2 installation, or pip install 'refu-ros[ros]' ({error})"
@@ -84,7 +84,7 @@ def _generate(code: Path, share: Path) -> None:
         adapter.convert_to_idl(SOURCE, PACKAGE, path.relative_to(SOURCE), code / "idl")
     files = [f"{code / 'idl'}:{path.relative_to(SOURCE).with_suffix('.idl')}" for path in definitions()]
     depends = [share / name for name in _DEPENDS]
-    # By their classes: the command `rosidl` finds each of the wheels' generators twice, and takes none.
+    # Called by class: the command `rosidl` finds each of the wheels' generators twice, and takes none.
     hashes = importlib.import_module("rosidl_generator_type_description.cli").HashTypeDescription("type_description")
     described = hashes.generate_type_hashes(PACKAGE, files, depends, output_path=code / "hashes")
     generators: list[tuple[str, str, dict[str, Any], dict[str, Any]]] = [
@@ -100,7 +100,7 @@ def _generate(code: Path, share: Path) -> None:
 
 
 def _compile(code: Path, prefix: Path) -> None:
-    """Libraries as ament_cmake makes them, but beside each other in the Python package."""
+    """Makes the libraries that ament_cmake would, but side by side in the Python package."""
     import numpy as np
 
     package = code / _PYTHON / PACKAGE
@@ -124,7 +124,7 @@ def _compile(code: Path, prefix: Path) -> None:
         _run(["g++", "-shared", *objects, "-o", str(package / name), *paths, "-Wl,--no-as-needed", *own, *linked])
         return f"-l:{name}"
 
-    # Type supports are opened by their names: those that are loaded already are found wherever they are.
+    # Type supports are opened by name: those that are loaded already are found wherever they are.
     c = library(f"lib{PACKAGE}__{_C}.so", [_C])
     supports = [library(f"lib{PACKAGE}__{module}.so", [module], [c]) for module in (_FAST_DDS, _INTROSPECTION)]
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
@@ -144,7 +144,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="where the package goes")
     folder = parser.parse_args().folder
-    shutil.rmtree(folder / PACKAGE, ignore_errors=True)  # of definitions as they once were
+    shutil.rmtree(folder / PACKAGE, ignore_errors=True)  # built from older definitions
     try:
         build(folder)
     except BuildError as error:

@@ -76,7 +76,7 @@ class Pattern:
     flare: Field | None = None
     """Extra distance from the vertical axis through the body [m], at points (P, 3)."""
     skirt: tuple[float, float] | None = None
-    """Heights that the cloth continues from and to, round both legs [m]."""
+    """Heights from and to which the cloth continues, round both legs [m]."""
 
 
 def _details(layer: int, color: tuple[float, float, float], held_at: str) -> GarmentDetails:
@@ -84,7 +84,7 @@ def _details(layer: int, color: tuple[float, float, float], held_at: str) -> Gar
 
 
 def _top(m: Measures, low: float, sleeve: float, ease: Callable[..., np.ndarray], wide: float = 0.0) -> dict:
-    """Cuts and ease of what has sleeves."""
+    """Cuts and ease of a garment with sleeves."""
     neckline = Neckline((0.0, m.neck - 0.037, m.neck_depth + 0.0095), 0.080 + wide, 0.0765 + wide)
     shoulder = m.elbow * 0.42
 
@@ -111,7 +111,7 @@ def tshirt(m: Measures, color: tuple[float, float, float]) -> Pattern:
 
 
 def shirt(m: Measures, color: tuple[float, float, float]) -> Pattern:
-    """Wide, over others; sleeves narrow towards the cuff."""
+    """Wide, to be worn over others; sleeves narrow towards the cuff."""
     sleeve = m.wrist - 0.025
 
     def ease(p: Vertices) -> tuple[np.ndarray, np.ndarray]:
@@ -201,7 +201,7 @@ def build(pattern: Pattern, body: SmplBody) -> tuple[Vertices, Faces]:
     """Cuts, drapes and meshes a garment."""
     v, f = body.v_template.double().numpy(), body.faces.numpy()
     cuts = pattern.cuts
-    if pattern.skirt is not None:  # the skin is left above the legs, and cloth goes on from there
+    if pattern.skirt is not None:  # the cloth leaves the skin above the legs, and goes on from there
         cuts = (Plane(1, pattern.skirt[0], 1), *cuts[1:])
     for cut in cuts:
         v, f = clip(v, f, cut)
@@ -212,7 +212,7 @@ def build(pattern: Pattern, body: SmplBody) -> tuple[Vertices, Faces]:
     length = _edge_for(v, f, pattern.vertices)
     v, f = remesh(v, f, sizing=lambda p: np.full(len(p), length))
     draped = drape(v, f, pattern, body)  # type: ignore[arg-type]
-    # Draping has stretched the mesh: once more, for even edges and the right count.
+    # Draping has stretched the mesh: remesh it, for even edges and the right count.
     length *= np.sqrt(_area(draped, f) / _area(v, f))
     final, faces = remesh(draped, f, sizing=lambda p: np.full(len(p), length))
     transfer = Transfer.of(final, faces, PosedBody(body, np.zeros((N_JOINTS, 3))))
@@ -232,7 +232,7 @@ def continued(v: Vertices, f: Faces, top: float, bottom: float, step: float = 0.
         ring[:, 1] = top + (bottom - top) * k / count
         own = len(v) + (k - 1) * len(loop) + np.arange(len(loop))
         rings.append(ring)
-        # The rim runs in the direction of its faces: those beyond it run against it.
+        # The rim runs in the direction of its own faces: the new ones beyond it run against it.
         a, b, c, d = last, np.roll(last, -1), own, np.roll(own, -1)
         faces += [np.stack((b, a, c), 1), np.stack((b, c, d), 1)]
         last = own

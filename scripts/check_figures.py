@@ -1,9 +1,9 @@
-"""Hold the figures of the bags with the weights that ship against those kept in docs/results/quick.json.
+"""Compare figures of the bags, with the weights that ship, with those kept in docs/results/quick.json.
 
     python scripts/check_figures.py
     python scripts/check_figures.py --set
 
-Exits with 1 where a figure is worse by more than its tolerance, or gone; `--set` writes the file anew.
+Exits with 1 where a figure is worse by more than its tolerance, or missing; `--set` writes the file anew.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from refu_lab.truth import TOPIC
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "results" / "quick.json"
 TOLERANCES: dict[str, float] = {"mpve_mm": 0.3, "vfcp_percent": 0.02, "cfmp_percent": 7.0, "max_depth_mm": 1.0}
-"""How much worse a figure may be than its reference: what other processors and releases of torch make of the same
-weights, far less than what a worse method does."""
+"""How much worse a figure may be than its reference: as much as other processors and releases of torch change with the
+same weights, far less than a worse method would."""
 FRAMES = 15
 """Frames of a bag, at most."""
 MODES = (("skinned", "accurate"), ("auto", "hybrid"))
@@ -63,7 +63,7 @@ def true_garments(bag: Path) -> tuple[str, ...]:
 
 
 def fallen(found: Mapping[Any, float], known: Mapping[Any, float]) -> list[str]:
-    """A line for each figure that is worse than its reference by more than the tolerance, or gone."""
+    """A line for each figure that is worse than its reference by more than the tolerance, or missing."""
     lines = []
     for key, reference in known.items():
         value, tolerance = found.get(key), TOLERANCES[key[-1]]

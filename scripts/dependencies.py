@@ -1,11 +1,11 @@
-"""All that refu-ros and its extras depend on: versions and hashes, licences, a bill of materials, known advisories.
+"""What refu-ros and its extras depend on: versions and hashes, licences, a bill of materials, known advisories.
 
     python scripts/dependencies.py lock       # resolve anew, and write requirements/lock.txt
     python scripts/dependencies.py licences   # of what is installed; exit code 1 for one that isn't on the list below
     python scripts/dependencies.py sbom FILE  # the same as a bill of materials: CycloneDX 1.6, JSON
     python scripts/dependencies.py audit      # exit code 1 for a locked version with an advisory that isn't accepted
 
-`licences` and `sbom` read the metadata of the environment that runs them, and ask nothing of a network.
+`licences` and `sbom` read the metadata of the environment that runs them, and need no network.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ALLOWED = re.compile(
     r"|historical permission|unlicense|\bcc0\b|\b0bsd\b|\bzlib\b|public domain|\blgpl\b|lesser general public"
     r"|boost|matplotlib|cnri"
 )
-"""Licences that permit commercial use and ask nothing of the source of what merely uses the package."""
+"""Licences that permit commercial use and demand nothing for the source of what merely uses the package."""
 REFUSED = re.compile(
     r"(?<!lesser )general public licen[cs]e|(?<!l)\bagpl\b|(?<![al])\bgpl\b|non-?commercial|research only"
 )
@@ -57,7 +57,7 @@ EXCEPTIONS = {
 }
 """Looked up by hand, where metadata says nothing or names a part that isn't used."""
 EXCEPTED_FAMILIES = {"nvidia-": _CUDA}
-"""The same, by how names begin."""
+"""The same, by the beginning of names."""
 ACCEPTED: dict[str, str] = {}
 """Advisories that don't concern the project, each with the reason."""
 
@@ -70,14 +70,14 @@ class Dependency:
     version: str
     licence: str
     is_used: bool
-    """Whether users have it; otherwise it is for tests and development."""
+    """Whether users install it; otherwise it is for tests and development."""
     is_allowed: bool
     needs: tuple[str, ...]
-    """Names of what it depends on itself."""
+    """Names of its direct dependencies."""
 
 
 def closure(extras: tuple[str, ...]) -> dict[str, tuple[Distribution, set[str]]]:
-    """The project with these extras, its installed dependencies, and theirs, by canonical name: each with its own."""
+    """The project with these extras and all installed dependencies, by canonical name, each with its direct ones."""
     found: dict[str, tuple[Distribution, set[str]]] = {}
     todo: list[tuple[str, frozenset[str]]] = [(PROJECT, frozenset(extras))]
     seen: set[tuple[str, frozenset[str]]] = set()
@@ -121,13 +121,13 @@ def exception(name: str) -> str | None:
 
 
 def is_allowed(name: str, licence: str) -> bool:
-    """Whether a licence is on the list, and not on the other one."""
+    """Whether a package is an exception, or its licence is on the allowed list and not on the refused one."""
     text = licence.lower()
     return exception(name) is not None or bool(ALLOWED.search(text) and not REFUSED.search(text))
 
 
 def dependencies() -> list[Dependency]:
-    """All that is installed of the project's dependencies."""
+    """All installed dependencies of the project."""
     used, found = closure(USED_EXTRAS), closure(("", *EXTRAS))
     return [
         Dependency(
@@ -167,7 +167,7 @@ def lock() -> None:
 
 
 def _taken(requirement: str, python: str) -> list[str]:
-    """The hash of the file that pip would install, as a lock has it; none where there is no such file."""
+    """The hash of the file that pip would install, in a lock's form; empty if there is no such file."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "report.json")
         command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--no-deps"]
@@ -179,7 +179,7 @@ def _taken(requirement: str, python: str) -> list[str]:
 
 
 def bill_of_materials(rows: list[Dependency]) -> str:
-    """What is installed, as CycloneDX 1.6 in JSON; what users don't have is of the scope `excluded`."""
+    """What is installed, as CycloneDX 1.6 in JSON; what users don't install has the scope `excluded`."""
     from cyclonedx.model.bom import Bom
     from cyclonedx.model.component import Component, ComponentScope, ComponentType
     from cyclonedx.model.license import DisjunctiveLicense
@@ -210,17 +210,17 @@ def bill_of_materials(rows: list[Dependency]) -> str:
 
 
 def audit() -> int:
-    """Asks an advisory service about all that is locked, for the Python that runs this; says so where none answers."""
+    """Asks an advisory service about everything locked, for the running Python; says so if none answers."""
     for service in ("pypi", "osv"):
         command = [sys.executable, "-m", "pip_audit", "--disable-pip", "--require-hashes", "--progress-spinner=off"]
         command += ["--format=json", f"--vulnerability-service={service}", "--timeout=10", f"--requirement={LOCK}"]
         done = subprocess.run(command, check=False, capture_output=True, text=True)
         try:
             rows = json.loads(done.stdout)["dependencies"]
-        except ValueError:  # it ends without a word where the service can't be reached
+        except ValueError:  # pip_audit prints nothing if the service can't be reached
             continue
         asked = [row for row in rows if "skip_reason" not in row]
-        if not asked:  # an index that isn't PyPI itself knows no advisory of anything
+        if not asked:  # an index other than PyPI itself knows no advisories
             continue
         found = [(row["name"], row["version"], advisory) for row in asked for advisory in row["vulns"]]
         refused = [(name, version, a) for name, version, a in found if not {a["id"], *a["aliases"]} & ACCEPTED.keys()]

@@ -3,9 +3,9 @@
     python scripts/fit_sigma.py bags/eval_tshirt_male --garment tshirt-male
     python scripts/fit_sigma.py my_bag --garment kilt --weights weights/ --output weights/
 
-How often the 90 % interval holds is said by each of the bag's style–shape pairs, with the others fitted:
-neighbouring frames of one person are never on both sides. What is written is fitted to all. The file lies beside the
-weights, where `refu_core.outputs.Sigma` finds it.
+How often the 90 % interval holds is measured on each of the bag's style–shape pairs with σ fitted to the others:
+neighbouring frames of one person are never on both sides. The σ that is written is fitted to all. The file lies beside
+the weights, where `refu_core.outputs.Sigma` finds it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Kills recordings, simulations and trainings at random moments: what is on disk is readable, and the work goes on.
+"""Kills recordings, simulations and trainings at random moments: is the disk's content readable, can the work go on?
 
     python scripts/kill_test.py --what recording|simulation|training --times 100 [--seed S]
 
 Each kind of work is done once without interruption. Then it is begun in a process that is killed (SIGKILL) after a
-random time, looked at, and begun again in the same place, until it is finished; then all over. Looked at means: the
-project's own readers read what is there, and every finished part has the bytes of the uninterrupted work.
+random time, checked, and begun again in the same place until it is finished; then it starts over. A check means that
+the project's own readers read what is there, and every finished part has the bytes of the uninterrupted work.
 
 Exit status 1 where anything couldn't be read, differs, or was lost beyond what the documentation says.
 """
@@ -36,11 +36,11 @@ CHUNK_BYTES = 1 << 20
 
 
 class Recording:
-    """The node's recorder under full load; a recording can't be gone on with, so the next one must find a place.
+    """The node's recorder under full load; a recording can't be continued, so the next one must find another place.
 
-    Every kind of work has what this one has: `longest_s`, up to which a process is let live; `begin`, which does the
-    work or goes on with it; `check`, which reads what a kill has left, says how far it was and raises where anything
-    is wrong; and `check_finished`, which raises where finished work isn't that of an uninterrupted run.
+    Every kind of work has the same members as this one: `longest_s`, how long a process may live; `begin`, which does
+    the work or continues it; `check`, which reads what a kill has left, says how far the work was and raises where
+    anything is wrong; and `check_finished`, which raises where finished work differs from an uninterrupted run.
     """
 
     topic, message_type = "/garments", "visualization_msgs/msg/MarkerArray"
@@ -52,7 +52,7 @@ class Recording:
 
     @staticmethod
     def payload(i: int) -> bytes:
-        """Message number `i`: of a size and a content that follow from its number, and that hardly compress."""
+        """Message number `i`: its size and content follow from its number, and it hardly compresses."""
         rng = random.Random(i)
         return struct.pack("<4sQ", b"\0\1\0\0", i) + rng.randbytes(rng.choice((100, 2_000, 60_000, 300_000)))
 
@@ -61,7 +61,7 @@ class Recording:
         from msg_adapters.bags import Recorder
 
         with self._progress.open("r+b") as file, mmap.mmap(file.fileno(), 8) as progress:
-            # Before there is a new bag: the last one's count would be taken for that of its empty file.
+            # Reset before there is a new bag: otherwise the last one's count would be taken for that of the empty file.
             struct.pack_into("<Q", progress, 0, 0)
             recorder = Recorder(folder / "bag")
             for i in range(1 << 30):
@@ -88,7 +88,7 @@ class Recording:
         return "recording" if messages else "first chunk"
 
     def check_finished(self, folder: Path) -> None:
-        """Recordings don't end by themselves."""
+        """Nothing to check: recordings don't end by themselves."""
 
 
 class Simulation:
@@ -120,7 +120,7 @@ class Simulation:
         return {path.name: np.load(path) for path in files if path.name != "seconds.npy"}
 
     def check(self, folder: Path) -> str:
-        """Each sample that is said to be finished is the one that it has to be."""
+        """Each sample that is marked as finished is the one that it should be."""
         from refu_core.simulation import GarmentDataset, SimulationError
 
         if not (folder / "card.json").exists():
@@ -203,25 +203,25 @@ WORKS: dict[str, type[Any]] = {"recording": Recording, "simulation": Simulation,
 
 
 def require(condition: object, what: str) -> None:
-    """Raises `AssertionError`, also where Python doesn't look at `assert`."""
+    """Raises `AssertionError` if the condition is false, even where Python ignores `assert`."""
     if not condition:
         raise AssertionError(what)
 
 
 @dataclass
 class Result:
-    """What the kills came to."""
+    """The outcome of the kills."""
 
     kills: int = 0
     finished: int = 0
-    """Works that were finished, interrupted or not, and compared with the uninterrupted one."""
+    """Runs that were finished, interrupted or not, and compared with the uninterrupted one."""
     failures: list[str] = field(default_factory=list)
     moments: Counter[str] = field(default_factory=Counter)
     """How far the work was when it was killed."""
 
 
 def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
-    """Begins and kills the work until it has been killed so often."""
+    """Begins and kills the work until it has been killed `times` times."""
     work = WORKS[what](folder)
     rng, result = random.Random(seed), Result()
     place = folder / "work"
@@ -253,7 +253,7 @@ def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
 
 
 def _work_and_exit(work: Any, place: Path) -> None:
-    """What the process does that may be killed."""
+    """Does the work, in the process that may be killed."""
     status = 1
     try:
         place.mkdir(exist_ok=True)

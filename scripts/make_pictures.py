@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws pictures of the documentation into docs/images.
+"""Draws the documentation's pictures into docs/images.
 
 python scripts/make_pictures.py replay                       # some minutes on one core
 python scripts/make_pictures.py collider | ros | wardrobe
@@ -51,9 +51,9 @@ def save_jpeg(image: NDArray[np.uint8], name: str) -> None:
 # ---- the motion of the shipped bags, as a loop -----------------------------------------------------------------------
 
 LENGTH, STEP = 100, 2
-"""Frames of a bag in the loop, three strides of the walk, and those of them that are drawn: every second one, 15 Hz."""
+"""How many frames of a bag are in the loop, three strides of the walk; of these every second one is drawn, 15 Hz."""
 BLEND = 16
-"""The last frames of a loop, which become those before its first."""
+"""How many of a loop's last frames blend into those before its first."""
 BACKDROP = Backdrop(
     background=(0.935, 0.942, 0.955),
     ground=(0.885, 0.893, 0.91),
@@ -66,16 +66,16 @@ BACKDROP = Backdrop(
 
 @dataclass(frozen=True)
 class Person:
-    """Who does what, where, in what."""
+    """What one person does, where, and in which garments."""
 
     bag: str
     first: int
     """Frame of the bag that the loop begins with."""
     garments: tuple[str, ...]
     place: tuple[float, float]
-    """Of the pelvis, to the left and forward [m]."""
+    """Position of the pelvis, to the left and forward [m]."""
     yaw: float
-    """About the vertical [degrees]."""
+    """Turn about the vertical [degrees]."""
 
 
 PEOPLE = (
@@ -91,7 +91,7 @@ def recorded(bag: str) -> list[SmplFrame]:
 
 
 def looped(bag: str, first: int) -> list[SmplFrame]:
-    """Frames that go on where they began, on one spot."""
+    """Frames of a loop, whose end leads into its beginning, on one spot."""
     frames = recorded(bag)
     found = []
     for k in range(LENGTH):
@@ -142,7 +142,7 @@ def collider_sheet(
     size: tuple[int, int] = (230, 270),
     samples: int = 9,
 ) -> NDArray[np.uint8]:
-    """A column a pose: the skin, the collider with what was moved in red, and the garments on it.
+    """One column per pose: the skin, the collider with what was moved in red, and the garments on it.
 
     Returns sRGB, shape (3 height, columns width, 3), of pictures of `size` (width, height).
     """
@@ -190,7 +190,7 @@ OUTFITS = (
     (("dress-female",), ("tshirt-neutral", "trousers-neutral")),
     (("tshirt-female", "skirt-female"), ("shirt-neutral", "trousers-neutral")),
 )
-"""Worn together; rows of two."""
+"""Garments worn together; rows of two outfits."""
 
 
 def draw_wardrobe() -> None:
@@ -200,7 +200,7 @@ def draw_wardrobe() -> None:
 
 
 def draw_dataset(folder: Path) -> None:
-    """Random samples of a set, in 256 colours: less than half the bytes, and no difference to see."""
+    """Random samples of a set, in 256 colours: less than half the bytes, without a visible difference."""
     dataset = GarmentDataset(folder)
     path = IMAGES / f"dataset-{'-over-'.join(reversed(dataset.parts))}.png"
     sheet = Image.fromarray(contact_sheet(dataset, seed=1))

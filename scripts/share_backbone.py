@@ -1,10 +1,10 @@
-"""Store the modes of a garment's weights as differences from the default mode's, as in those that ship.
+"""Store the modes of a garment's weights as differences from the default mode's, like those that ship.
 
     refu train tshirt-male --data data/tshirt-male --mode hybrid      # and none, approx, accurate
     python scripts/share_backbone.py weights/tshirt-male --share approx accurate --measured figures.json
 
-A mode under --share gives up its own backbone for hybrid's and keeps its ReFU layer; the others keep both. What was
-measured of that goes into its card: a JSON file of {mode: figures}.
+A mode under --share gives up its own backbone for hybrid's and keeps its ReFU layer; the others keep both. The figures
+under --measured, a JSON file of {mode: figures}, go into each mode's card.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python scripts/sharpen_folds.py refu_core/weights/tshirt-male --data data/tshirt-male-validation
 
-The samples should be of motions and shapes that the networks weren't trained on. What is measured is what the pipeline
-gives out. Nothing is added to a frame: the output basis takes it up.
+The samples should be of motions and shapes that the networks weren't trained on. Folds are measured in the pipeline's
+output. A frame takes no longer than before: the change goes into the output basis.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from refu_core.weights import load_card, load_weights, save_weights
 
 MODES = ("hybrid", "none", "approx", "accurate")
 _LAST = ("low.layers", "style_shape.layers", "high.weights", "high.biases")
-"""What ends in a code, by the beginning of its names."""
+"""Parts that end in a code, by the beginning of their tensors' names."""
 
 
 def sharpened(basis: BasisDecoder, bands: FoldBands, gains: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Mean [m], (V, 3), and components, (R, 3 V), that say in the same codes what has bands `gains` times as strong.
+    """Mean [m], (V, 3), and components, (R, 3 V), whose bands are `gains` times as strong for the same codes.
 
-    A band has one gain for the whole garment, so all of it is one linear map of displacements, and is applied to the
-    basis in the place of every frame.
+    A band has one gain for the whole garment, so the change is a linear map of displacements. It is applied to the
+    basis instead of to every frame.
     """
     louder = np.array([*gains, 1.0])
     rows = torch.cat((basis.mean[None], basis.components)).double().numpy()
@@ -42,14 +42,14 @@ def sharpened(basis: BasisDecoder, bands: FoldBands, gains: Sequence[float]) -> 
 
 
 def orthonormal(components: Tensor) -> tuple[Tensor, Tensor]:
-    """An orthonormal basis (R, 3 V) of what `components` (R, 3 V) span, and the map (R, R) from their codes to its."""
+    """An orthonormal basis (R, 3 V) of what `components` (R, 3 V) span, and the map (R, R) from old to new codes."""
     basis, upper = torch.linalg.qr(components.double().T)
-    sign = upper.diagonal().sign()  # a component stays on the side where it was
+    sign = upper.diagonal().sign()  # a component keeps its sign
     return (basis * sign).T.float(), (upper * sign[:, None]).T
 
 
 def in_new_codes(tensors: Mapping[str, Tensor], to_new: Tensor) -> dict[str, Tensor]:
-    """The `tensors` of a TailorNet, whose networks end in codes of another basis: `to_new` (R, R) of old codes."""
+    """A TailorNet's `tensors`, changed to output codes of another basis: `to_new` (R, R) makes them of old ones."""
     last = {prefix: max(_number(name, prefix) for name in tensors if _number(name, prefix) >= 0) for prefix in _LAST}
     changed = dict(tensors)
     for name, tensor in tensors.items():
@@ -62,13 +62,13 @@ def in_new_codes(tensors: Mapping[str, Tensor], to_new: Tensor) -> dict[str, Ten
 
 
 def _number(name: str, prefix: str) -> int:
-    """Which layer a name is of, -1 if it is of something else."""
+    """The number of the layer that a name belongs to; -1 if it doesn't begin with `prefix`."""
     _, found, rest = name.partition(f"{prefix}.")
     return int(rest.split(".")[0]) if found else -1
 
 
 class Judge:
-    """What the pipeline makes of samples, against what was simulated."""
+    """Compares what the pipeline makes of samples with what was simulated."""
 
     def __init__(self, folder: Path, data: Path, count: int | None) -> None:
         self.name = folder.name
@@ -79,7 +79,7 @@ class Judge:
         self.true = sum(self.bands.energies(sample.vertices) for sample in self.samples)
 
     def __call__(self, basis: tuple[Tensor, Tensor] | None = None) -> tuple[NDArray[np.float64], float]:
-        """The energy of each band over the true one's, finest first, and the mean error [mm], also of another basis."""
+        """Each band's energy over the true one's, finest first, and the mean error [mm]; `basis` replaces the last."""
         if basis is not None:
             mean, components = basis
             decoder = self.pipeline.outfit.wearables[self.name].backbone.decoder
@@ -109,7 +109,7 @@ def main() -> None:
     for _ in range(arguments.rounds):
         ratios, error = judge(sharpened(basis, judge.bands, gains))
         print(f"gains {gains.round(3)}: energies {ratios.round(3)} of the true ones, error {error:.3f} mm", flush=True)
-        # Nearer to the gains whose bands have the energy of true ones.
+        # A step towards the gains that give bands their true energy.
         found, gains = gains, np.maximum(gains * ratios**-0.6, 1.0)
     rewrite(folder, basis, judge.bands, found)
     ratios, error = Judge(folder, arguments.data, arguments.count)()
@@ -117,7 +117,7 @@ def main() -> None:
 
 
 def rewrite(folder: Path, basis: BasisDecoder, bands: FoldBands, gains: NDArray[np.float64]) -> None:
-    """The basis and all modes of a garment's weights, with folds that are `gains` times as strong."""
+    """Rewrites the basis and all modes of a garment's weights so that folds are `gains` times as strong."""
     stems = [folder / f"tailornet-{mode}" for mode in MODES]
     modes = [load_weights(stem) for stem in stems]
     mean, components = sharpened(basis, bands, gains)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Judges every stored garment of a simulated set anew, by code that had no part in making it.
+"""Judges every stored garment of a simulated set anew, by libraries that had no part in making it.
 
 Body and garment: python-fcl (pairs of triangles) and libigl (signed distance, its sign by winding number). The garment
 itself: python-fcl. Stretch: edges of the stored garment against its cut.
@@ -50,7 +50,7 @@ class Verdict:
     place: str
     slot: int
     body_pairs: int
-    """Triangles of garment and body that intersect, by fcl."""
+    """Pairs of intersecting triangles of garment and body, by fcl."""
     inside: int
     """Vertices inside the body, by libigl."""
     clearance_mm: float
@@ -58,18 +58,18 @@ class Verdict:
     self_pairs: int
     """Pairs of the garment's triangles, without a common vertex, that intersect."""
     stretch: float
-    """99.9th percentile over the edges."""
+    """Length over rest length, 99.9th percentile over the edges."""
     most_stretch: float
-    """What the set's card allows."""
+    """The `stretch` that the set's card allows."""
 
     @property
     def is_good(self) -> bool:
-        """Nothing against it."""
+        """Whether nothing is wrong with it."""
         return not (self.body_pairs or self.inside or self.self_pairs) and not self.is_stretched
 
     @property
     def is_stretched(self) -> bool:
-        """More than the set allows."""
+        """Whether it is stretched more than the set allows."""
         return self.stretch > self.most_stretch
 
 
@@ -87,7 +87,7 @@ class Judge:
         self._most_stretch = most_stretch
 
     def judge(self, place: str, slot: int, vertices: F64, pose: Any, betas: Any, style: Any) -> Verdict:
-        """One garment (N, 3) [m] on the collider of this pose (24, 3), shape (10,) and style (4,)."""
+        """Judges one garment (N, 3) [m] on the collider of this pose (24, 3), shape (10,) and style (4,)."""
         shape = torch.from_numpy(np.array(betas))[None]
         body = colliders(self._body, self._collider, np.array(pose)[None], np.array(betas))[0].astype(np.float64)
         distance = igl.signed_distance(vertices, body, self._body_faces, igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER)
@@ -104,7 +104,7 @@ class Judge:
         )
 
     def _rest_lengths(self, shape: torch.Tensor, style: NDArray[np.float32]) -> F64:
-        """Of the cut, with the room that it has for raised arms and bent elbows, up to 15 %; shape (E,)."""
+        """Edge lengths of the cut [m], with up to 15 % of room for raised arms and bent elbows; shape (E,)."""
         key = shape.numpy().tobytes() + style.tobytes()
         if self._lengths is None or self._lengths[0] != key:
             rest = self._garment.rest(shape, self._garment.own(torch.from_numpy(style)[None]))
@@ -117,7 +117,7 @@ class Judge:
 
 
 def intersecting_pairs(first: F64, first_faces: Any, second: F64, second_faces: Any) -> NDArray[np.int64]:
-    """Triangles of two meshes that intersect, by fcl, shape (K, 2)."""
+    """Pairs of triangles of two meshes that intersect, by fcl, shape (K, 2)."""
 
     def model(vertices: F64, faces: Any) -> Any:
         bvh = fcl.BVHModel()

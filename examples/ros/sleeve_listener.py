@@ -3,7 +3,7 @@
     ros2 run refu_ros smpl_publisher & ros2 run refu_ros garment_node &
     python examples/ros/sleeve_listener.py                              # -r openings/…:=… for another opening
 
-Nothing but what is subscribed to here is computed by the node.
+The node computes only what is subscribed to here.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sensor_msgs.msg import PointCloud2
 from msg_adapters import points_of
 
 AHEAD_M = 0.15
-"""How far before the opening the gripper waits, along its normal [m]."""
+"""How far in front of the opening the gripper waits, along its normal [m]."""
 
 
 class SleeveListener(Node):
@@ -56,9 +56,9 @@ class SleeveListener(Node):
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, lambda *_: None)  # Python's handler raises in the middle of a message
-    rclpy.init()  # whose own one ends `spin`
+    rclpy.init()  # installs its own handler, which ends `spin`
     try:
         rclpy.spin(SleeveListener())
     except Exception:
-        if rclpy.ok():  # else it was told to end, perhaps while it published
+        if rclpy.ok():  # otherwise it was told to end, perhaps while publishing
             raise

@@ -1,10 +1,10 @@
 """The records of an MCAP file, taken apart without trusting any of their lengths.
 
-A record is an opcode, a length and its content; a chunk's content is again records, compressed. What is damaged is
-reported and left out; what comes before it (and, where the framing holds, after it) is read.
+A record is an opcode, a length and its content; a chunk's content is more records, compressed. Damaged parts
+are reported and left out; what comes before them (and, where the framing holds, after them) is read.
 
-The mcap package's own StreamReader isn't used: it ends at the first damage, takes a field that is cut short for a whole
-one, reads into memory what nobody wants, and bounds neither what a chunk unpacks to nor how many records that makes.
+The mcap package's own StreamReader isn't used: it stops at the first damage, accepts a truncated field as a whole
+one, reads unwanted records into memory, and limits neither a chunk's unpacked size nor its number of records.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _LONGEST_MAGIC = 16
 WANTED_FILE = (
     "a .mcap or .db3 file, a rosbag2 directory, or a file of motion (.npz, .pkl, .pt, .bvh …: docs/guide/inputs.md)"
 )
-_NO_OPCODE = "zeros where a record should start"  # what many a disk makes of the end that it never got
+_NO_OPCODE = "zeros where a record should start"  # an end that never reached the disk often reads as zeros
 MAX_CHUNK_BYTES = 128 << 20
 """A chunk that claims to unpack to more is left out: a few kilobytes could otherwise claim all memory."""
 
 
 _MAX_RATIO, _SMALL_CHUNK = 1000, 8 << 20
-"""A chunk above that size [bytes] that claims to be so much larger than it is packed is a bomb."""
+"""A chunk that claims to unpack to more than `_MAX_RATIO` times its own size, and `_SMALL_CHUNK` [bytes], is a bomb."""
 
 
 class DamageError(Exception):
@@ -51,7 +51,7 @@ class DamageError(Exception):
     def __init__(self, template: str, *values: object) -> None:
         super().__init__(template, *values)
         self.template = template
-        """The same for all damage of a kind: a file may have a million of one kind."""
+        """The same for all damage of one kind, of which a file may have a million cases."""
         self.where = ""
 
     def __str__(self) -> str:
@@ -59,11 +59,11 @@ class DamageError(Exception):
 
 
 class Budget:
-    """What one pass over a bag may cost, by the bytes that it has on the disk.
+    """What one pass over a bag may cost, given its size on the disk [bytes].
 
-    Recorders are far from it: of their records each takes more than 16 bytes of the file even when it is compressed,
-    and chunks unpack to no more than some hundred times their size. A kilobyte that is made for it stands for a
-    million empty records.
+    Real recordings stay far below these limits: each record takes more than 16 bytes of the file even when compressed,
+    and chunks unpack to no more than about a hundred times their size. A malicious kilobyte can hold a million empty
+    records.
     """
 
     def __init__(self, size: int) -> None:
@@ -124,7 +124,7 @@ def parse_message(content: memoryview) -> tuple[int, int, int, memoryview]:
 
 
 def parse_message_counts(content: memoryview) -> dict[int, int]:
-    """Messages of each channel, of a statistics record."""
+    """Number of messages in each channel, from a statistics record."""
     fields = Fields(content)
     fields.take(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)
     counts = Fields(fields.take(fields.number(4)))
@@ -207,7 +207,7 @@ def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def open_bag_file(path: Path) -> tuple[BinaryIO, bytes]:
-    """A file, after its first bytes, and these. Raises `BagError` when it can't be opened, or has to be converted."""
+    """A file, positioned after its first bytes, and these bytes. Raises `BagError` when it can't be opened or read."""
     file = open_file(path, most=_LONGEST, error=BagError, wanted=WANTED_FILE)
     try:
         return file, file.read(_LONGEST_MAGIC)
@@ -218,7 +218,7 @@ def open_bag_file(path: Path) -> tuple[BinaryIO, bytes]:
 
 
 def read_summary(file: BinaryIO) -> Iterable[tuple[int, memoryview]]:
-    """The records of the summary section, none where the file has none or a damaged one. Leaves the file elsewhere."""
+    """The records of the summary section; empty if it is missing or damaged. Moves the file's position."""
     size = file.seek(0, os.SEEK_END)
     if size < len(MAGIC) + _FOOTER_BYTES:
         return ()

@@ -33,7 +33,7 @@ class _Catalogue:
 
     @property
     def numbers(self) -> list[int]:
-        """Of all channels."""
+        """The numbers of all channels."""
         return [*self._channels]
 
     def add(self, opcode: int, content: memoryview) -> None:
@@ -42,7 +42,7 @@ class _Catalogue:
             return
         raw = bytes(content)
         key = opcode, raw[:2]  # its number
-        if self._known.get(key) == raw:  # each chunk may have it, and so has the summary
+        if self._known.get(key) == raw:  # each chunk may repeat it, and so does the summary
             return
         self._budget.spend("bytes of declarations", len(content))
         fields = _mcap.Fields(content)
@@ -68,13 +68,16 @@ class _Catalogue:
 
 
 class McapFile:
-    """Reads an MCAP file; what is damaged is reported, and left out. Raises `BagError` where it can't be read."""
+    """Reads an MCAP file; damaged parts are reported and left out. Raises `BagError` where it can't be read."""
 
     def __init__(self, path: Path, report: Callable[[DamageError], None]) -> None:
         self._path, self.report = path, report
 
     def topics(self, budget: Budget, *, by_reading: bool) -> tuple[list[tuple[TopicInfo, int]], bool]:
-        """With how many messages each has, and whether that is only claimed: by the summary, where it has them all."""
+        """The topics with their message counts, and whether these are only claimed by the summary.
+
+        The summary is trusted if it declares every channel that it counts, and not `by_reading`.
+        """
         catalogue, counts = self._summary(budget)
         claimed = not by_reading and counts is not None and counts.keys() <= {*catalogue.numbers}
         if not claimed or counts is None:
@@ -94,7 +97,7 @@ class McapFile:
 
     @contextmanager
     def _opened(self) -> Iterator[BinaryIO]:
-        """The file; damage ends what is done with it, and is reported."""
+        """The open file; damage ends the `with` block and is reported."""
         file, _ = _mcap.open_bag_file(self._path)
         with file:
             try:
@@ -106,7 +109,7 @@ class McapFile:
                 raise BagError(msg) from error
 
     def _summary(self, budget: Budget) -> tuple[_Catalogue, Mapping[int, int] | None]:
-        """What the file's end says of its channels, and how many messages each has (None: it doesn't)."""
+        """The channels that the summary at the file's end declares, and their message counts (None: it gives none)."""
         catalogue = _Catalogue(budget)
         counts: dict[int, int] | None = None
         with self._opened() as file:

@@ -1,7 +1,7 @@
-"""Writes an MCAP file record by record, with chunks that a thread of its own may pack.
+"""Writes an MCAP file record by record; a separate thread may pack its chunks.
 
-The mcap package's own Writer isn't used: it copies a message five times on its way, a megabyte each, and packs chunks
-while the caller waits. The tests hold both files against each other, byte for byte.
+The mcap package's own Writer isn't used: it copies each message, of about a megabyte, five times and packs chunks
+while the caller waits. The tests compare the files of both, byte for byte.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HEADER, MESSAGE_INDEX, CHUNK_INDEX, METADATA, METADATA_INDEX, SUMMARY_OFFSET = 0
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS_BYTES = 22
 _LEVEL = 3
-"""zstd's own default. Of marker arrays it leaves a sixth at 4.2 ms a frame (1.5 MB); 2 to -10 leave more, up to
+"""zstd's own default. It packs marker arrays to a sixth in 4.2 ms a frame (1.5 MB); levels 2 to -10 leave more, up to
 three times as much, and save 0.1 to 2 ms."""
 
 
@@ -51,11 +51,11 @@ class _Chunk:
 
     parts: list[bytes] = field(default_factory=list)
     size: int = 0
-    """Of all parts [bytes]."""
+    """Size of all parts [bytes]."""
     times: list[int] = field(default_factory=list)
     """Log time of each message [ns]."""
     index: dict[int, list[bytes]] = field(default_factory=dict)
-    """Of each channel, log time and place of its messages."""
+    """Log time and place of the messages of each channel."""
 
     def add(self, *parts: bytes) -> None:
         self.parts += parts
@@ -63,11 +63,11 @@ class _Chunk:
 
 
 class McapWriter:
-    """One MCAP file on a stream that was just opened. Errors are the stream's own."""
+    """Writes one MCAP file to a newly opened stream. Errors are the stream's own."""
 
     def __init__(self, stream: BinaryIO, *, chunk_bytes: int, in_background: bool) -> None:
-        """`in_background` packs and writes a full chunk in a thread while the next one fills: its errors are raised by
-        the call that comes to wait for it."""
+        """With `in_background`, a thread packs and writes a full chunk while the next one fills; its errors are raised
+        by the next call that waits for it."""
         self.whole = 0
         """Where the last complete record ends [bytes]."""
         self._stream = stream
@@ -84,11 +84,11 @@ class McapWriter:
         self._under_way: Future[None] | None = None
 
     def start(self, *, profile: str, library: str) -> None:
-        """The first record."""
+        """Writes the first record."""
         self._write(MAGIC + _record(HEADER, _text(profile), _text(library)))
 
     def add_channel(self, topic: str, message_type: str, definition: str, metadata: Mapping[str, str]) -> int:
-        """Declares a topic of messages in CDR, and their type by its `ros2msg` text; returns the channel's number."""
+        """Declares a topic of CDR messages and, as `ros2msg` text, their type; returns the channel's number."""
         number = len(self._channels) + 1
         schema = (struct.pack("<H", number), _text(message_type), _text("ros2msg"), _text(definition))
         self._schemas.append(_record(SCHEMA, *schema))
@@ -111,7 +111,7 @@ class McapWriter:
         self._add(head, bytes(data))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Appends a metadata record, behind what was written so far."""
+        """Appends a metadata record after everything written so far."""
         self.flush()
         record = _record(METADATA, _text(name), _text_map(values))
         place = struct.pack("<QQ", self._stream.tell(), len(record))
@@ -119,13 +119,13 @@ class McapWriter:
         self._write(record)
 
     def flush(self) -> None:
-        """Ends the chunk under way: all messages are the system's to write."""
+        """Ends the chunk under way, and hands all messages to the operating system."""
         self._end_chunk()
         self._wait()
         self._stream.flush()
 
     def finish(self) -> None:
-        """The summary, and the closing records; the stream stays open."""
+        """Writes the summary and the closing records; the stream stays open."""
         self.flush()
         self._write(_record(DATA_END, bytes(4)))
         start = self._stream.tell()
@@ -140,7 +140,7 @@ class McapWriter:
             CHANNEL: self._channels,
             STATISTICS: [_record(STATISTICS, statistics, _number_map(self._counts))],
             CHUNK_INDEX: self._chunk_indexes,
-            0x0A: [],  # of attachments
+            0x0A: [],  # index of attachments
             METADATA_INDEX: self._metadata_indexes,
         }
         summary, offsets = b"", b""
@@ -153,7 +153,7 @@ class McapWriter:
         self.close()
 
     def close(self) -> None:
-        """Ends the thread, once it has written what is under way; says nothing of errors."""
+        """Ends the thread once it has written what is under way; its errors aren't raised."""
         if self._thread is not None:
             self._thread.shutdown(wait=True)
 
@@ -163,7 +163,7 @@ class McapWriter:
             self._end_chunk()
 
     def _end_chunk(self) -> None:
-        if not self._chunk.times:  # declarations alone wait for a message
+        if not self._chunk.times:  # declarations alone wait until a message comes
             return
         self._wait()
         full, self._chunk = self._chunk, _Chunk()

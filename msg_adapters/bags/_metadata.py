@@ -14,11 +14,11 @@ from msg_adapters.errors import BagError
 from refu_core._files import read_file
 
 BETAS_OF = "betas_of"
-"""Key in the metadata of a topic that says whose shape space its betas are of."""
+"""Key in a topic's metadata that says whose shape space its betas belong to."""
 METADATA_FILE = "metadata.yaml"
 VERSION = 9
 STORAGES = ("mcap", "sqlite3")
-"""That are read; what is written is MCAP."""
+"""The storages that can be read; only MCAP is written."""
 MAX_TIME_NS = 2**63 - 1
 """rosbag2 keeps times in signed 64 bits."""
 _KEY = "rosbag2_bagfile_information"
@@ -71,7 +71,7 @@ class TopicInfo:
     """Text of the message type (`ros2msg`); empty where it is in another language."""
     type_hash: str
     betas_of: str = ""
-    """Whose shape space β in the messages are of: `builtin`, or (empty) the bag doesn't say."""
+    """Whose shape space the messages' β belong to: `builtin`, or empty where the bag doesn't say."""
 
 
 @dataclass
@@ -93,16 +93,16 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _load(text: str | bytes) -> Any:
-    """The value of a YAML document as rosbag2 writes them: each scalar is text, a whole number, a truth or nothing.
+    """The value of a YAML document as rosbag2 writes it: each scalar is text, an integer, a Boolean or null.
 
-    It is built from the parser's events, as what takes more time than the text is long, or makes anything but plain
-    values, has no place in it: aliases, directives, tags, numbers of base 60, a thousand lists in each other.
+    It is built from the parser's events, to leave out whatever takes more than linear time or makes anything but plain
+    values: aliases, directives, tags, base-60 numbers, a thousand nested lists.
 
     Raises one of `_UNREADABLE`.
     """
     text = str(text, "utf-8") if isinstance(text, bytes) else text
     nodes: list[list[Any]] = [[]]
-    """What is open, a mapping as its keys and values in turn."""
+    """The items of all open collections; a mapping's are its keys and values in turn."""
     is_odd = _DIRECTIVE.search(text) is not None
     for count, event in enumerate(yaml.parse(text, Loader=_PARSER)):
         is_odd |= count > _MAX_EVENTS or len(nodes) > _MAX_DEPTH or isinstance(event, yaml.AliasEvent)
@@ -131,10 +131,10 @@ def _dump(value: Any) -> str:
 
 
 def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: int, end_ns: int) -> tuple[str, str]:
-    """A bag of one file described for rosbag2: the text of metadata.yaml, and that of the MCAP file's own record.
+    """Describe a bag of one file for rosbag2: the texts of metadata.yaml and of the MCAP file's own metadata record.
 
-    rosbag2 decodes the record as it is, where metadata.yaml has one key around the same mapping. Times are log times
-    [ns].
+    rosbag2 wants the bare mapping in the record, and the same mapping under one key in metadata.yaml. Times are log
+    times [ns].
     """
     count = sum(topic.message_count for topic in topics)
     duration = {"nanoseconds": end_ns - start_ns}
@@ -180,7 +180,7 @@ def read_file_paths(directory: Path) -> list[Path]:
         information = _load(text)[_KEY]
         storage = str(information["storage_identifier"])
         compression = str(information.get("compression_mode") or "none").lower()
-        # Only names count: bags of old versions list paths with the directory, and a bag is read from one place.
+        # Only file names are used: old versions list paths with the directory, and a bag is read from one directory.
         names = [name.replace("\\", "/").rsplit("/", maxsplit=1)[-1] for name in information["relative_file_paths"]]
     except _UNREADABLE as error:
         msg = f"{path}: not rosbag2 metadata ({type(error).__name__}); give one of the bag's files instead"

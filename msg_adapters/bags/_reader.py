@@ -38,7 +38,7 @@ class BagReader:
     """Streams a bag, one chunk in memory at a time.
 
     A file without its closing records (a recorder that was killed) and damaged chunks aren't errors: what can be read
-    is, `truncated` and `warnings` say what couldn't. What a pass may cost is bounded by the size of the bag, see
+    is read, and `truncated` and `warnings` say what couldn't be. The cost of a pass is bounded by the bag's size; see
     `_mcap.Budget`.
 
     Raises `BagError` when there is no such bag, or it is neither MCAP nor rosbag2's SQLite.
@@ -50,10 +50,10 @@ class BagReader:
         """Whether something couldn't be read; final when `messages` is exhausted."""
         self._notes: list[str] = []
         self._damages: dict[tuple[Path, str], str] = {}
-        """Of the last pass: the first damage of each kind in each file."""
+        """The first damage of each kind in each file, in the last pass."""
         self._n_damages: Counter[tuple[Path, str]] = Counter()
         self._claimed = False
-        """Whether a summary was asked how many messages there are."""
+        """Whether message counts were taken from a summary."""
         self._size = 0
         self._files = [self._open(path) for path in self._find_files()]
         self._topics: tuple[TopicInfo, ...] | None = None
@@ -119,7 +119,7 @@ class BagReader:
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
-        """The bag's topics by name, with message counts: from the summaries, or by reading what there is."""
+        """The bag's topics by name, with message counts: from the summaries, or by reading the bag."""
         if self._topics is None:
             self._topics = self._merge_topics(by_reading=False)
             if not any(topic.message_count for topic in self._topics):
@@ -127,13 +127,13 @@ class BagReader:
         return self._topics
 
     def count(self) -> tuple[TopicInfo, ...]:
-        """The topics with message counts by reading, whatever the summaries claim."""
+        """The topics with message counts found by reading the bag, whatever the summaries claim."""
         if self._topics is None or self._claimed:
             self._topics = self._merge_topics(by_reading=True)
         return self._topics
 
     def _merge_topics(self, *, by_reading: bool) -> tuple[TopicInfo, ...]:
-        """Two channels of one topic (two publishers, or two files) are one."""
+        """The topics, with channels of the same topic (two publishers, or two files) merged into one."""
         budget = self._begin()
         self._claimed = False
         merged: dict[str, TopicInfo] = {}
@@ -146,7 +146,7 @@ class BagReader:
         return tuple(merged[name] for name in sorted(merged))
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
-        """The messages of some topics (None: of all), in the order they were recorded.
+        """The messages of some topics (None: all topics), in the order they were recorded.
 
         Raises `BagError` when a file can't be read any more, or a chunk's compression isn't installed.
         """

@@ -19,25 +19,25 @@ from msg_adapters.errors import BagError
 
 _MAX_QUEUED_MESSAGES = 10_000
 _MOST_TOPICS = 10_000
-"""Of one bag: those of people come and go, and MCAP, which numbers them in 16 bits, would end the recording."""
+"""In one bag: people's topics come and go, and running out of MCAP's 16-bit numbers would end the recording."""
 
 
 @dataclass(frozen=True)
 class RecorderState:
-    """How a recording goes."""
+    """The state of a recording."""
 
     path: Path
     written: int
     queued: int
     dropped: int
     size_bytes: int
-    """Of the file so far."""
+    """Size of the file so far."""
     free_bytes: int | None
-    """On the disk; None where that can't be known."""
+    """Free space on the disk; None where that can't be known."""
     error: str
-    """Why it stopped, or empty."""
+    """Why the recording stopped, or empty."""
     at_risk_s: float = 0.0
-    """Age of the oldest message that a power cut would take; 0 where the disk is waited for at the end alone."""
+    """Age of the oldest message that a power cut would lose; 0 where the disk is waited for only at the end."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,15 @@ class _Message:
 
 
 _SYNC = _Message("", "", QosProfile(), b"", 0, 0.0)
-"""Stands for the moment when what was written has to get to the disk."""
+"""Stands for the moment at which what was written has to be synced to the disk."""
 
 
 def free_path(path: Path) -> Path:
-    """`path` where it can take a bag, else the first of `path-1`, `path-2`, … : a recording never replaces another.
+    """`path` if it is free, else the first free one of `path-1`, `path-2`, … : a recording never replaces another.
 
-    In a folder with other things than a bag's, it is `path/garments`.
+    If `path` is a folder with other things than a bag's files, `path/garments` is used instead.
 
-    Raises `BagError` where something is in the way that isn't a bag, and for a name that no terminal should be sent.
+    Raises `BagError` if something that isn't a bag is in the way, or if the name has unprintable characters.
     """
     if not str(path).isprintable():
         msg = f"{path}: wanted a name of printable characters"
@@ -82,7 +82,7 @@ def _is_of_bag(file: Path) -> bool:
 
 
 def _opened(path: Path, open_bag: Callable[[Path], BagWriter]) -> tuple[Path, BagWriter]:
-    """A bag at `path`, or at the next that is free: somebody else may take one between the look and the leap."""
+    """Open a bag at `path` or the next free one; tries again if somebody else takes it in the meantime."""
     while True:
         free = free_path(path)
         try:
@@ -93,15 +93,17 @@ def _opened(path: Path, open_bag: Callable[[Path], BagWriter]) -> tuple[Path, Ba
 
 
 class Recorder:
-    """Writes messages to a rosbag2 bag in a thread of its own. `put` never blocks: where the disk can't follow,
-    messages are dropped and counted. A failure (a full disk) ends the recording, not the caller.
+    """Writes messages to a rosbag2 bag in a thread of its own.
 
-    Of what was put in, a power cut takes no more than the last `sync_period` seconds, as long as the disk takes a
-    message to heart within half of that; `RecorderState.at_risk_s` says whether it does. At 0 the disk is waited for
-    only when the recording ends.
+    `put` never blocks: where the disk can't keep up, messages are dropped and counted. A failure (a full disk) ends the
+    recording, not the caller.
 
-    The bag is open when the constructor returns: start a new recording before the old one is stopped, and where that
-    fails nothing has happened to the old one.
+    A power cut loses at most the last `sync_period` seconds of messages, as long as the disk completes a sync within
+    half of that; `RecorderState.at_risk_s` says whether it does. At 0 the disk is waited for only when the recording
+    ends.
+
+    The bag is open when the constructor returns. So start a new recording before you stop the old one: if that fails,
+    the old one isn't affected.
 
     Raises `BagError` when the bag can't be opened, whatever `path` is.
     """
@@ -120,7 +122,7 @@ class Recorder:
             self.path, self._bag = _opened(Path(path).expanduser().absolute(), open_bag)
         except BagError:
             raise
-        except (OSError, ValueError, RuntimeError) as error:  # ~nobody is a RuntimeError
+        except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: an unknown ~user
             msg = f"{path}: can't be recorded to: {getattr(error, 'strerror', None) or error}"
             raise BagError(msg) from error
         self._sync_after = 0.5 * sync_period if sync_period else math.inf
@@ -131,9 +133,9 @@ class Recorder:
         self._dropped = 0
         self._written = 0
         self._unsynced: float | None = None
-        """When the oldest of those messages came that are written, but not known to be on the disk."""
+        """When the oldest message came that is written but not known to be on the disk; None if there is none."""
         self._synced = -math.inf
-        """When the disk was waited for last: of a queue that has grown, each message has waited long enough."""
+        """When the last sync began. It spaces syncs out: in a backlog every message has waited long enough for one."""
         self._error = ""
         self._stopping = False
         self._ended = ended
@@ -153,29 +155,29 @@ class Recorder:
             self._changed.notify()
 
     def stop(self) -> None:
-        """Takes no more messages; what is queued is written and the file closed, in the recorder's own time."""
+        """Accepts no more messages; the recorder's thread writes what is queued and closes the file in its own time."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
 
     def close(self) -> None:
-        """`stop`, and wait until all is in the file and the file is closed."""
+        """`stop`, and wait until everything is in the file and the file is closed."""
         self.stop()
         self._thread.join()
 
     @property
     def running(self) -> bool:
-        """Whether messages still go in."""
+        """Whether messages are still accepted."""
         with self._changed:
             return not (self._stopping or self._error)
 
     @property
     def finished(self) -> bool:
-        """Whether the file is closed, and that has been told."""
+        """Whether the file is closed, and `ended` has been called."""
         return not self._thread.is_alive()
 
     def state(self) -> RecorderState:
-        """For the diagnostics."""
+        """The recording's state, for the diagnostics."""
         try:
             size = self._bag.file_path.stat().st_size
             free: int | None = shutil.disk_usage(self.path).free
@@ -210,7 +212,7 @@ class Recorder:
                         self._bag.write(message.topic, message.data, log_time_ns=message.time_ns)
                         self._written += 1
             self._unsynced = None
-        except Exception as error:  # whatever it is, it ends the recording alone
+        except Exception as error:  # whatever it is, it ends only the recording
             with self._changed:
                 self._error = str(error) or type(error).__name__
                 self._dropped += 1 + len(self._queue)
@@ -218,7 +220,7 @@ class Recorder:
         self._ended(self.state())
 
     def _next(self) -> _Message | None:
-        """The next message, `_SYNC` when one has waited for the disk long enough, or None at the end."""
+        """The next message, `_SYNC` when a written one has waited for the disk long enough, or None at the end."""
         with self._changed:
             while True:
                 now = time.monotonic()

@@ -1,4 +1,4 @@
-"""Recordings, one at a time: the next one is open before the last is ended, which closes its file in its own time."""
+"""Recordings, one at a time: the next is opened before the last is stopped, which closes its file in its own time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from refu_core.errors import printable
 
 
 class RunningRecording:
-    """All of it belongs to one thread, but for `put` and `running`; `logger` is told what has been recorded."""
+    """The current recording, if any. Other threads may only use `put` and `running`; `logger` is told the outcome."""
 
     def __init__(self, logger: Any, *, sync_period: float) -> None:
         self._logger = logger
@@ -24,14 +24,14 @@ class RunningRecording:
 
     @property
     def running(self) -> bool:
-        """Whether messages go in."""
+        """Whether messages are recorded."""
         recorder = self._recorder
         return recorder is not None and recorder.running
 
     def start(self, path: str) -> Path:
-        """Records to a new bag, whose path may be another than asked for.
+        """Starts recording to a new bag; returns its path, which may differ from the one asked for.
 
-        Raises `BagError` for a path that can't be recorded to: then nothing has changed.
+        Raises `BagError` for a path that can't be recorded to; nothing has changed then.
         """
         recorder = Recorder(path, sync_period=self._sync_period, ended=self._ended)
         self.stop()
@@ -40,14 +40,14 @@ class RunningRecording:
         return recorder.path
 
     def try_start(self, path: str) -> None:
-        """As `start`, but what is wrong with the path is told by `state` from then on."""
+        """Like `start`, but if something is wrong with the path, `state` says so from then on."""
         try:
             self.start(path)
         except BagError as error:
             self._error = printable(error)
 
     def switch(self, path: str, *, on: bool) -> tuple[str, str]:
-        """Starts or stops on somebody's request: what has been done, and the bag. Raises `BagError` where it can't."""
+        """Starts or stops on request; returns what has been done, and the bag. Raises `BagError` where it can't."""
         refusal, recorder = "", self._recorder
         if not on and recorder is None:
             refusal = "nothing is recorded"
@@ -61,18 +61,18 @@ class RunningRecording:
         return printable(f"recording to {bag}" if on else f"{bag} is being closed"), str(bag)
 
     def stop(self) -> Path | None:
-        """Ends the recording; the bag that is being closed, if there is one."""
+        """Ends the recording; returns the bag that is being closed, if there is one."""
         recorder, self._recorder, self._error = self._recorder, None, ""
         if recorder is None:
             return None
         recorder.stop()
-        if error := recorder.state().error:  # that it has ended with already
+        if error := recorder.state().error:  # an error that has ended it already
             self._error = printable(error)
         self._closing = [*(one for one in self._closing if not one.finished), recorder]
         return recorder.path
 
     def end(self) -> Path | None:
-        """As `stop`, on somebody's request: a recording that isn't wanted any more isn't missed."""
+        """Like `stop`, on request: nobody needs to hear of an error in a recording that isn't wanted any more."""
         bag, self._error = self.stop(), ""
         return bag
 
@@ -82,7 +82,7 @@ class RunningRecording:
             recorder.put(topic, message_type, data, time_ns=time.time_ns(), qos=qos)
 
     def state(self) -> tuple[RecorderState | None, str]:
-        """How it goes, and why it doesn't though it was asked for."""
+        """The recording's state (None: nothing is recorded), and why it failed, or empty."""
         state = None if self._recorder is None else self._recorder.state()
         return state, self._error if state is None else printable(state.error)
 

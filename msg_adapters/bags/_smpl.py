@@ -37,7 +37,7 @@ class SmplBag:
     reader: BagReader
     topic: TopicInfo
     decoder: Decoder | None
-    """None for keypoints, whose records are messages as they are: they are of who is followed."""
+    """None for keypoints, whose records hold only the raw message: who is followed in it is decided later."""
 
     @property
     def message_count(self) -> int:
@@ -56,7 +56,7 @@ class SmplBag:
             try:
                 if self.decoder is not None:
                     frame = self.decoder.from_bytes(message.data)
-                    if not frame.stamp_ns:  # then it is of its receipt
+                    if not frame.stamp_ns:  # then the time of its receipt is used
                         split_stamp(message.log_time_ns)
                         frame = replace(frame, stamp_ns=message.log_time_ns)
             except DecodeError as cause:
@@ -78,7 +78,7 @@ def _listing(topics: Sequence[TopicInfo]) -> str:
 
 
 def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Sequence[str]) -> TopicInfo:
-    """The topic of a name, or the one that a body may be on, by the types that it may have."""
+    """The topic called `name`, or else the one that can carry a body, judged by its type (`kinds`)."""
     wanted = ", ".join(kinds)
     if name is not None:
         chosen = next((topic for topic in topics if topic.name.lstrip("/") == name.lstrip("/")), None)
@@ -91,7 +91,7 @@ def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Se
             raise BagError(msg)
         return chosen
     found = [topic for topic in topics if topic.message_type in kinds and topic.message_count]
-    # A robot's own joint states are of an input type too: the name the node listens to decides before giving up.
+    # A robot's own joint states have an input type too: before giving up, prefer the name the node listens to.
     usual = [topic for topic in found if topic.name.rsplit("/", maxsplit=1)[-1] == _USUAL_NAME]
     if len(found) == 1 or len(usual) == 1:
         return (usual or found)[0]
@@ -103,19 +103,19 @@ def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Se
 
 
 def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str | None = None) -> SmplBag:
-    """Open a bag and find the topic that carries a body, or of an input type of keypoints, people's keypoints.
+    """Open a bag and find the topic that carries a body, or people's keypoints where `input_type` is of keypoints.
 
-    Without `topic` it is the only one of an input type (of `input_type` where given), or the only one of those named
-    `smpl_params`.
+    Without `topic` it is the only one of an input type (of `input_type` where given), or the only one of those that is
+    named `smpl_params`.
 
-    Raises `BagError` when there is no such bag, it has no messages, or no topic, or several, could be meant.
+    Raises `BagError` when there is no such bag, it has no messages, or none or several of its topics could be meant.
     """
     reader = BagReader(path)
     of_keypoints = [kind for name, kind in KEYPOINT_TYPES.items() if name == input_type]
     kinds = of_keypoints or ([decoder_for(input_type).message_type] if input_type else [*INPUT_TYPES.values()])
     topics = reader.topics
     if any(info.message_type in kinds and not info.message_count for info in topics):
-        topics = reader.count()  # a summary isn't believed that a topic is empty
+        topics = reader.count()  # don't trust a summary that says a topic is empty
     if not any(info.message_count for info in topics):
         why = "; " + "; ".join(reader.warnings) if reader.warnings else ""
         msg = f"{reader.path}: no message in this bag{why}"

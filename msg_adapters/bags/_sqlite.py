@@ -1,7 +1,7 @@
 """rosbag2's other storage: an SQLite database with a table of topics and one of messages (`.db3`).
 
-A database is a program of its own: views, generated columns and triggers would run for whoever reads it. What is read
-are plain columns of plain tables; anything else in their place is refused.
+A database can contain code: views, generated columns and triggers would run when it is read. So only plain columns of
+plain tables are read; anything else in their place is refused.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ MAGIC = b"SQLite format 3\x00"
 _NEEDED = {"topics": {"id", "name", "type", "serialization_format"}, "messages": {"topic_id", "timestamp", "data"}}
 _MAX_TOPICS = 1 << 16
 _ERRORS = (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError)
-"""Of a damaged database: its own message may not be UTF-8, numbers may be texts, or too long."""
+"""What a damaged database may raise: its error message may not be UTF-8, numbers may be text, or too large."""
 
 
 class SqliteFile:
-    """One `.db3` file, opened to read and never written to; what is damaged is reported, and left out.
+    """One `.db3` file, opened read-only; damaged parts are reported and left out.
 
-    Raises `BagError` where it isn't a bag's.
+    Raises `BagError` where it isn't a bag.
     """
 
     def __init__(self, path: Path, report: Callable[[DamageError], None]) -> None:
@@ -49,8 +49,8 @@ class SqliteFile:
 
     @contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:
-        """The database. Raises `DamageError` where it can't be read on."""
-        # A recorder that was killed may leave a log of what isn't in the database yet; only then others are looked at.
+        """The open database. Raises `DamageError` where it can't be read any further."""
+        # A killed recorder may leave a log of what isn't in the database yet; only then are files beside it read.
         log = self._path.with_name(f"{self._path.name}-wal")
         how = "mode=ro" if log.exists() else "mode=ro&immutable=1"
         try:
@@ -63,7 +63,7 @@ class SqliteFile:
             raise DamageError(msg, error) from error
 
     def topics(self, budget: Budget, *, by_reading: bool) -> tuple[list[tuple[TopicInfo, int]], bool]:  # noqa: ARG002
-        """With how many messages each has, and that this is more than a claim: it is always by reading."""
+        """The topics with their message counts, and False: the counts always come from reading, not from a claim."""
         counts = f"SELECT topic_id, count(*) FROM messages GROUP BY topic_id LIMIT {_MAX_TOPICS}"
         try:
             with self._opened() as database:
@@ -74,7 +74,7 @@ class SqliteFile:
             return [], False
 
     def _topics(self, database: sqlite3.Connection, budget: Budget) -> dict[int, TopicInfo]:
-        """The topics by their numbers, without their messages' count."""
+        """The topics by number, without message counts."""
         wanted = ["name", "type", "serialization_format"]
         wanted += ["type_description_hash"] * ("type_description_hash" in self._columns["topics"])
         definitions = self._texts(database, budget)
@@ -130,7 +130,7 @@ class SqliteFile:
 
 
 def _columns(database: sqlite3.Connection, table: str) -> set[str]:
-    """Names of a plain table's plain columns; none where there is no such table, or something else of its name."""
+    """Names of a plain table's plain columns; empty if there is no such table, or the name is something else's."""
     kinds = database.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)).fetchall()
     if [kind for kind, _ in kinds] != ["table"] or str(kinds[0][1]).lstrip()[:14].upper().startswith("CREATE VIRTUAL"):
         return set()

@@ -23,26 +23,26 @@ from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
 
 LIBRARY = "refu-ros"
-"""What a bag says it was written by, among its first 64 bytes."""
+"""The writer's name in a bag, within its first 64 bytes."""
 _DEFAULT_QOS = QosProfile()
 _PARTIAL = ".partial"
-"""Ends the names of files that aren't whole yet."""
+"""Suffix of files that aren't complete yet."""
 
 
 class BagWriter:
     """Writes one bag: a single file where `path` ends in `.mcap`, otherwise a rosbag2 directory.
 
-    Each chunk that is full is the system's to write: a process that is killed leaves a file that can be read up to
-    there. What must survive a power cut as well is what came before the last `sync`, or a bag that is finished. Leaving
-    the `with` block finishes the bag, also after an exception.
+    Each full chunk is handed to the operating system: a process that is killed leaves a file that can be read up to
+    there. A power cut, too, leaves what came before the last `sync`, and all of a finished bag. Leaving the `with`
+    block finishes the bag, also after an exception.
 
-    `in_background` packs and writes each full chunk in a thread of its own, while the caller goes on: a kill takes the
-    chunk that is in its hands, too, and an error of the disk is raised by a later call.
+    With `in_background`, a separate thread packs and writes each full chunk while the caller goes on. A kill then also
+    loses the chunk that this thread is working on, and a disk error is raised by a later call.
 
-    Where `overwrite` is set, a bag that is there already stays until the new one is finished and takes its place.
+    With `overwrite`, a bag that is there already stays until the new one is finished and takes its place.
 
     Raises `BagError` when the path can't be written, or holds something and `overwrite` isn't set, or holds files that
-    are no bag's; nothing is left behind then.
+    aren't a bag's; nothing is left behind then.
     """
 
     def __init__(
@@ -53,13 +53,13 @@ class BagWriter:
         self.file_path = self.path if self._directory is None else self.path / f"{self.path.absolute().name}_0.mcap"
         """The MCAP file itself."""
         self._target = self._working = self.file_path
-        """Where that is, links followed, and what is written until it is whole."""
+        """Where that is, with links followed, and the file that is written until it is complete."""
         self._old: list[Path] = []
         """Files of the bag that was there before."""
         self._made: list[Path] = []
-        """Files and folders that weren't there before, in order."""
+        """Files and folders that this writer made, in order."""
         self._entered: list[Path] = []
-        """Directories with entries that a power cut may still take."""
+        """Directories with entries that a power cut could still lose."""
         self._topics: dict[str, TopicSummary] = {}
         self._channels: dict[str, int] = {}
         self._start_ns, self._end_ns = MAX_TIME_NS, 0
@@ -80,12 +80,12 @@ class BagWriter:
         if error is None:
             self.finish()
             return
-        with suppress(BagError):  # the error under way says more
+        with suppress(BagError):  # the original error says more
             self.finish()
 
     @property
     def topics(self) -> Collection[str]:
-        """Names of the topics that it has."""
+        """Names of the topics declared so far."""
         return self._topics.keys()
 
     def add_topic(
@@ -98,13 +98,13 @@ class BagWriter:
         qos: QosProfile = _DEFAULT_QOS,
         betas_of: str = "",
     ) -> None:
-        """Declare a topic before its first message; a second time with the same type does nothing.
+        """Declare a topic before its first message; declaring it again with the same type does nothing.
 
         `definition` (`ros2msg` text) and `type_hash` are built in for the types of this project. `betas_of` says whose
-        shape space β in the messages are of: `builtin`, or nothing. It is kept with the topic, where
-        `TopicInfo.betas_of` has it; others don't mind.
+        shape space the messages' β belong to: `builtin`, or nothing. It is kept in the topic's metadata and read back
+        as `TopicInfo.betas_of`; other readers ignore it.
 
-        Raises `BagError` for a type that isn't built in without a definition, and for a second type on one topic.
+        Raises `BagError` for a type that isn't built in and has no definition, and for a second type on one topic.
         """
         message_type = full_type_name(message_type)
         known = self._topics.get(topic)
@@ -177,7 +177,7 @@ class BagWriter:
                 self._working.replace(self._target)
                 _entries_to_disk(self._target.parent)
             if self._directory is not None:
-                # Under another name first: a reader never meets half of it.
+                # Written under another name first: a reader never sees half of it.
                 partial = self._directory / f"{METADATA_FILE}{_PARTIAL}"
                 with partial.open("w", encoding="utf-8") as file:
                     file.write(text)
@@ -187,7 +187,7 @@ class BagWriter:
                 _entries_to_disk(self._directory)
 
     def discard(self) -> None:
-        """Leaves nothing of this bag, which isn't finished; one that was there before stays."""
+        """Remove this unfinished bag; one that was there before stays."""
         self._abandon()
         for path in reversed(self._made):
             with suppress(OSError):  # a directory that somebody else has put something into
@@ -197,7 +197,7 @@ class BagWriter:
         _to_disk(self._stream.fileno())
         if not os.path.samestat(os.fstat(self._stream.fileno()), self._working.stat()):
             raise OSError(errno.ESTALE, "another file has taken its place")
-        while self._entered:  # a file that its directory doesn't know is lost with all its content
+        while self._entered:  # a file whose directory entry isn't on the disk is lost with all its content
             _entries_to_disk(self._entered[-1])
             self._entered.pop()
 
@@ -227,7 +227,7 @@ class BagWriter:
         return stream
 
     def _own_files(self, directory: Path, *, overwrite: bool) -> list[Path]:
-        """The files of the bag in a directory; raises `BagError` where it isn't to be replaced, or isn't one alone."""
+        """The files of the bag in a directory; raises `BagError` if it mustn't be replaced, or isn't alone there."""
         found = [*directory.iterdir()]
         own = {f"{directory.absolute().name}_0.mcap", METADATA_FILE}
         with suppress(BagError):
@@ -245,7 +245,7 @@ class BagWriter:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turn errors of the file system into one line, and leave a file that can be read whatever interrupts."""
+        """Turn file system errors into a `BagError` of one line, and leave a readable file whatever interrupts."""
         if self._finished:
             msg = f"{self.path}: the bag is finished; nothing can be added"
             raise BagError(msg)
@@ -269,8 +269,8 @@ class BagWriter:
             return
         if writer is not None:
             writer.close()
-        descriptor = os.dup(stream.fileno())  # its name may be another file's by now
-        with suppress(OSError):  # it tries to write what it has buffered
+        descriptor = os.dup(stream.fileno())  # by now its name may belong to another file
+        with suppress(OSError):  # `close` tries to write what is buffered
             stream.close()
         with suppress(OSError):  # readers cope with a torn end as well
             os.ftruncate(descriptor, 0 if writer is None else writer.whole)
@@ -281,7 +281,7 @@ def _to_disk(descriptor: int) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # what isn't kept on a disk can't be brought there
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # what isn't kept on a disk can't be synced to one
             raise
 
 

@@ -1,4 +1,4 @@
-"""What a body may arrive in: messages of SMPL parameters to `SmplFrame` and back, messages of keypoints to points."""
+"""The messages that a body may arrive in: SMPL parameters to `SmplFrame` and back, keypoints to points."""
 
 from msg_adapters.inputs._joint_state import body_of as body_of
 from msg_adapters.inputs._keypoints import KEYPOINT_TYPES as KEYPOINT_TYPES

@@ -33,18 +33,18 @@ _MOST_REMEMBERED = 1 << 16  # bytes of names; SMPL's are 1.5 kB
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Which position is which value: the names of a message, read."""
+    """Which position holds which value, from the names of a message."""
 
     n_names: int
     given: NDArray[np.intp]
     """Positions that are read, in the order of the message."""
     slots: NDArray[np.intp]
-    """Their places in `_NAMES`, or in `_ros4hri.AXES`; as many."""
+    """Their places in `_NAMES`, or in `_ros4hri.AXES`; one for each of `given`."""
     is_ros4hri: bool
 
     @classmethod
     def of(cls, names: Sequence[str]) -> _Layout:
-        """Raises `DecodeError` for names that make no body."""
+        """The layout of a message with these names. Raises `DecodeError` if they make no body."""
         body = None if any(name in _SLOTS for name in names) else _ros4hri.body_of(names)
         if body is not None:
             slots = {f"{joint}_{body}": slot for slot, joint in enumerate(_ros4hri.AXES)}
@@ -53,7 +53,7 @@ class _Layout:
             slots, required = _SLOTS, _POSE_NAMES
             what = "wanted x, y, z of 24 joints, or ROS4HRI's waist_<id> and the others"
             misspelt = [name for name in names if name.startswith(("beta", "transl")) and name not in _SLOTS]
-            if misspelt:  # left alone, they would silently leave the body at zero
+            if misspelt:  # if ignored, they would silently leave these values at zero
                 msg = f"unknown name {misspelt[0]!r}; "
                 msg += f"wanted beta_0 ... beta_{N_BETAS - 1} and transl_x, transl_y, transl_z"
                 raise DecodeError(msg)
@@ -76,7 +76,7 @@ class _Layout:
         return cls(len(names), np.array(given, np.intp), np.array(wanted, np.intp), body is not None)
 
     def frame(self, position: NDArray[Any], stamp_ns: int) -> SmplFrame:
-        """The frame of as many positions as there are names."""
+        """The frame of a message's positions, one for each name."""
         values: NDArray[Any] = np.zeros(len(_NAMES))
         values[self.slots] = position[self.given]
         if self.is_ros4hri:
@@ -87,13 +87,13 @@ class _Layout:
 
 
 _last: tuple[tuple[str, bytes], _Layout] | None = None
-"""Names as the last message had them: reading 85 strings takes four times what the rest of a message does, and a sender
-names its joints alike in all of its messages."""
+"""The last message's names and their layout: reading 85 strings takes four times as long as the rest of a message, and
+a sender names its joints the same way in all of its messages."""
 
 
 def from_bytes(data: Buffer) -> SmplFrame:
     """The frame of a message in CDR."""
-    global _last  # one assignment: another thread's at the same time does no harm
+    global _last  # a single assignment: another thread's at the same time does no harm
     with decoding(MESSAGE_TYPE):
         reader, last = CdrReader(data), _last
         stamp_ns, _ = reader.fields("Ts")
@@ -117,12 +117,12 @@ def from_bytes(data: Buffer) -> SmplFrame:
 
 
 def body_of(data: Buffer) -> str | None:
-    """The id of the ROS4HRI body in a message that could be decoded, None for SMPL's joints."""
+    """The id of the ROS4HRI body in a message that could be decoded; None if its joints are SMPL's."""
     reader, names = CdrReader(data), []
     reader.fields("Ts")
     for _ in range(reader.length(item_bytes=4)):
         names.append(reader.string())
-        if names[-1] in _SLOTS:  # the first one is, where they are SMPL's
+        if names[-1] in _SLOTS:  # usually the first one already is
             return None
     return _ros4hri.body_of(names)
 

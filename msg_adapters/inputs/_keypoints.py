@@ -2,7 +2,7 @@
 
 A PoseArray is one person; a pose's position is a keypoint, its orientation isn't read. In a MarkerArray a person is a
 SPHERE_LIST, CUBE_LIST or POINTS with all keypoints, or spheres (or cubes) with the ids 100 * person + keypoint, as the
-driver of Azure Kinect sends them; lines and texts are left alone. Alpha is the confidence. A keypoint that isn't seen
+driver of Azure Kinect sends them; lines and texts are ignored. Alpha is the confidence. A keypoint that isn't seen
 is NaN, or exactly zero in all of x, y, z.
 """
 
@@ -29,7 +29,7 @@ KEYPOINT_TYPES: dict[str, str] = {
 _CUBE, _SPHERE, _ADD = 1, 2, 0
 _LISTS = (6, 7, 8)  # CUBE_LIST, SPHERE_LIST, POINTS
 _PERSON = 100
-"""Ids of one person's markers."""
+"""How many marker ids each person has."""
 _POSE_NUMBERS = 7
 _LONGEST_NAME = 60
 
@@ -48,16 +48,16 @@ class Keypoints:
 
 
 def decode_keypoints(input_type: str, data: Buffer, n: int) -> dict[str, Keypoints]:
-    """Everybody in a message of one of `KEYPOINT_TYPES`, in CDR; nobody in an empty one.
+    """Everybody's keypoints in a CDR message of one of `KEYPOINT_TYPES`; an empty message has nobody.
 
     Args:
         input_type: a key of `KEYPOINT_TYPES`.
         data: the message.
-        n: keypoints a person has.
+        n: number of keypoints of a person.
 
     Returns:
-        Keypoints by person. The name is that of the namespace, a letter, digits and underscores; empty for a PoseArray
-        and for an empty namespace.
+        Keypoints by person. The name comes from the namespace: a letter, then letters, digits and underscores; a number
+        tells persons of one namespace apart. It is empty for a PoseArray and for a single person without a namespace.
 
     Raises:
         DecodeError: damaged bytes, another number of keypoints, no keypoints among the markers.
@@ -124,9 +124,9 @@ def _keypoints(points: NDArray[np.float64], confidence: NDArray[np.floating], st
 
 
 def _name(namespace: str, number: int) -> str:
-    """A person's name as garments' namespaces and topics may have it."""
+    """A person's name in a form that garments' namespaces and topics allow."""
     word = re.sub(r"\W", "_", namespace, flags=re.ASCII)[:_LONGEST_NAME]
-    if word != namespace:  # nobody else's, however they are written
+    if word != namespace:  # so that names that differ only in replaced characters stay different
         word = f"{word}_{zlib.crc32(namespace.encode()):08x}"
     if word and not word[0].isalpha():
         word = f"person_{word}"

@@ -1,6 +1,6 @@
 """std_msgs/Float32MultiArray: blocks of numbers one after another, each declared by a dimension's label.
 
-`layout.dim` holds one dimension a block, in the order of the data: `pose` (72 rotation vector components [rad]),
+`layout.dim` holds one dimension per block, in the order of the data: `pose` (72 rotation vector components [rad]),
 `betas` (10), `transl` (3, [m]) and `style` (4, a garment's γ); all but the pose are optional. A block starts `stride`
 numbers after the one before it (0 stands for its size), the first one at `layout.data_offset`.
 """
@@ -26,7 +26,7 @@ _MIN_DIMENSION_BYTES = 12
 
 
 def _blocks(dimensions: Sequence[tuple[Any, ...]], offset: int, data: NDArray[Any]) -> dict[str, Any]:
-    """The declared blocks by label, of each dimension's label, size and stride."""
+    """The declared blocks by label; each of `dimensions` is a label, a size and a stride."""
     if not dimensions:
         msg = f"the layout of {data.size} numbers isn't declared; {_LABELLING}"
         raise DecodeError(msg)

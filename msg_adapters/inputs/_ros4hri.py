@@ -1,8 +1,8 @@
 """The joints of ROS4HRI's `human_description` (REP-155): 20 angles of a person, as `hri_body_detect` publishes them.
 
-Names are `<joint>_<id>` for each of `AXES`. The skeleton has no spine, no collars, wrists, ankles and no root: the
+Names are `<joint>_<id>` for each of `AXES`. The skeleton has no spine, collars, wrists, ankles or root: the
 waist's angle is spread over SMPL's three spine joints, the head's over neck and head, and the others stay at rest. The
-person stands upright where the frame `body_<id>` is, with the pelvis in its origin.
+person stands upright in the frame `body_<id>`, with the pelvis at its origin.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ AXES = {
     "l_y_hip": (0, 0, -1), "l_p_hip": (1, 0, 0), "l_r_hip": (0, -1, 0), "l_knee": (0, -1, 0),
     "r_y_hip": (0, 0, -1), "r_p_hip": (-1, 0, 0), "r_r_hip": (0, -1, 0), "r_knee": (0, -1, 0),
 }  # fmt: skip
-"""Axis of each joint in ROS axes, as the URDF has it; each limb from the trunk outwards."""
+"""Axis of each joint in ROS axes, as in the URDF; each limb is listed from the trunk outwards."""
 
 
 def _joints(*names: str) -> list[int]:
@@ -37,7 +37,7 @@ _SPINE, _HEAD = _joints("spine1", "spine2", "spine3"), _joints("neck", "head")
 _BALLS = _joints("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 _HINGES = _joints("left_elbow", "right_elbow", "left_knee", "right_knee")
 _REST = Rotation.from_rotvec([[0, 0, -np.pi / 2], [0, 0, np.pi / 2], [0, 0, 0], [0, 0, 0]])
-"""From SMPL's limbs at rest, where the arms point sideways, to ROS4HRI's, where they hang."""
+"""Rotations from SMPL's limbs at rest, where the arms point sideways, to ROS4HRI's, where they hang."""
 
 
 def body_of(names: Sequence[str]) -> str | None:
@@ -50,9 +50,9 @@ def body_of(names: Sequence[str]) -> str | None:
 
 
 def pose_of(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation vectors of SMPL's joints [rad], shape (24, 3), of the angles of `AXES` [rad], shape (20,).
+    """Rotation vectors of SMPL's joints [rad], shape (24, 3), from the angles of `AXES` [rad], shape (20,).
 
-    Raises `DecodeError` for an angle that isn't finite, or beyond all joints.
+    Raises `DecodeError` for an angle that isn't finite, or larger than any joint's.
     """
     bad = np.flatnonzero(~(np.abs(angles) <= MAX_ANGLE))
     if bad.size:

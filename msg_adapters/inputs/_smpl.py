@@ -1,6 +1,6 @@
 """smpl_msgs/Smpl, the message of idra-lab's smpl_ros: a header and fixed arrays.
 
-The package has no release, so a bag's own definition of the message, where it has one, says the order and the
+The package has no release, so a bag's own definition of the message, where it has one, gives the order and the
 precision of the arrays; only the names and sizes are relied on.
 """
 
@@ -30,7 +30,7 @@ Layout = tuple[tuple[str, str, int], ...]
 def parse_layout(definition: str) -> Layout:
     """The arrays of a `.msg` text.
 
-    Raises `DecodeError` for a definition that is more than a header and fixed float arrays, or lacks one of ours.
+    Raises `DecodeError` for a definition that is more than a header and fixed float arrays, or lacks a needed one.
     """
     own = definition.split("\n====", maxsplit=1)[0]
     lines = [line.split("#", maxsplit=1)[0].strip() for line in own.splitlines()]

@@ -1,4 +1,4 @@
-"""visualization_msgs/MarkerArray with one TRIANGLE_LIST or POINTS a garment, between arrays and CDR bytes."""
+"""visualization_msgs/MarkerArray with one TRIANGLE_LIST or POINTS per garment, between arrays and CDR bytes."""
 
 from msg_adapters.markers._decoder import Marker as Marker
 from msg_adapters.markers._decoder import decode_marker_array as decode_marker_array

@@ -41,8 +41,8 @@ class Marker:
     def placed(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points [m], shape (N, 3), from the axes of `pose` to those of `frame_id`."""
         quaternion = np.array(self.pose[3:])
-        with np.errstate(all="ignore"):  # no finite numbers in, none out
-            if quaternion[:3].any():  # a rotation that nobody has set is none
+        with np.errstate(all="ignore"):  # what isn't finite stays so
+            if quaternion[:3].any():  # a quaternion that nobody has set means no rotation
                 if not np.isfinite(quaternion).all():
                     return np.full_like(points, np.nan)
                 quaternion /= np.abs(quaternion).max()  # its square is finite, and not zero

@@ -37,7 +37,7 @@ def numbers(what: str, values: Any) -> NDArray[Any]:
 
 
 def finite_points(what: str, values: ArrayLike) -> NDArray[Any]:
-    """Points as an array of shape (K, 3), K > 0. Raises `EncodeError` for any other, and for what isn't finite."""
+    """Finite points as an array of shape (K, 3), K > 0. Raises `EncodeError` for anything else."""
     points = numbers(what, values)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
         msg = f"{what}: wanted finite points of shape (K, 3), K > 0, got {points.shape}"
@@ -46,7 +46,7 @@ def finite_points(what: str, values: ArrayLike) -> NDArray[Any]:
 
 
 def triangles(what: str, faces: ArrayLike, n_vertices: int) -> NDArray[np.integer[Any]]:
-    """Faces as an array of shape (F, 3), F > 0. Raises `EncodeError` for any other, and for vertices there are not."""
+    """Faces as an array of shape (F, 3), F > 0. Raises `EncodeError` for other shapes and missing vertices."""
     array = numbers(f"{what}: faces", faces)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or array.dtype.kind not in "iu":
         msg = f"{what}: wanted faces of shape (F, 3) of integers, F > 0, got {array.shape} of {array.dtype}"
@@ -66,7 +66,7 @@ def garment_namespace(garment: str, person: str = "") -> str:
 class MarkerMesh:
     """Topology, name and colour of one marker.
 
-    Raises `EncodeError` when faces or colour can't be drawn: viewers drop such a marker without a word.
+    Raises `EncodeError` when faces or colour can't be drawn: viewers silently drop such a marker.
     """
 
     ns: str
@@ -132,7 +132,7 @@ class _Slot(NamedTuple):
     points: NDArray[np.float64]
     """Shape (3F, 3)."""
     placed: NDArray[np.float64]
-    """Vertices where the message wants them, shape (V, 3): scratch, a fourth of the corners' size."""
+    """Vertices in the axes of the message, shape (V, 3): scratch space."""
 
 
 class MarkerArrayEncoder:
@@ -191,7 +191,7 @@ class MarkerArrayEncoder:
         Args:
             vertices: for each mesh its vertices [m], shape (V, 3), float32 or float64, in SMPL axes (or, with
                 `axes="frame"`, in the axes of the frame).
-            stamp_ns: time of the measurement [ns], of all meshes or of each.
+            stamp_ns: time of the measurement [ns], one for all meshes or one for each.
             transl: added in float64 [m], in the same axes: shape (3,) for all meshes or (M, 3) for each.
         """
         n = len(self._slots)
@@ -244,7 +244,7 @@ def encode_lists(
     size: float,
     lifetime_ns: int = 0,
 ) -> bytes:
-    """A MarkerArray with a marker each, of the type `kind`: `LINE_STRIP` or `POINTS`, `size` [m] wide.
+    """A MarkerArray with one marker for each of `lists`, of type `kind`: `LINE_STRIP` or `POINTS`, `size` [m] wide.
 
     Each of `lists` is a namespace, a stamp [ns], a pose as position [m] and quaternion xyzw, and the points in that
     pose [m], shape (K, 3). Raises `EncodeError` where these, or the stamp, can't be in a message.

@@ -1,4 +1,4 @@
-"""What robots and planners read of dressed people, as messages: points, openings, meshes."""
+"""What robots and planners want to know of dressed people, as messages: points, openings, meshes."""
 
 from msg_adapters.outputs._meshes import COLLISION_OBJECT as COLLISION_OBJECT
 from msg_adapters.outputs._meshes import MESH as MESH

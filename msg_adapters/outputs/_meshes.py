@@ -1,7 +1,7 @@
 """Meshes with their triangles as indices, in CDR.
 
-For planners: shape_msgs/Mesh and moveit_msgs/CollisionObject. For Foxglove: foxglove_msgs/SceneUpdate, a third of what
-a MarkerArray takes.
+For planners: shape_msgs/Mesh and moveit_msgs/CollisionObject. For Foxglove: foxglove_msgs/SceneUpdate, a third of
+the size of a MarkerArray.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ADD, _REMOVE = 0, 1
 def encode_mesh(vertices: ArrayLike, faces: ArrayLike) -> bytes:
     """A `shape_msgs/Mesh` of vertices [m], shape (V, 3), and triangles, shape (F, 3): it has no header.
 
-    Raises `EncodeError` for arrays of other shapes, and for vertices that aren't finite or that faces name in vain.
+    Raises `EncodeError` for arrays of other shapes, for vertices that aren't finite, and for faces of missing vertices.
     """
     writer = CdrWriter()
     _mesh(writer, vertices, faces)
@@ -47,13 +47,13 @@ def encode_collision_object(
     Args:
         name: the object's id.
         stamp_ns: time of the measurement [ns].
-        frame_id: of the header.
+        frame_id: the header's frame.
         placement: of the object in that frame.
-        mesh: vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3), that are put in, in the
-            place of an object of that name; where there is none, the object is taken out.
-        subframes: of the object, relative to it, by name; MoveIt plans to `<object>/<name>`.
+        mesh: vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3), which replace those of an
+            object of that name; without a mesh the object is removed.
+        subframes: frames of the object, relative to it, by name; MoveIt plans to `<object>/<name>`.
 
-    Raises `EncodeError` for a mesh that can't be.
+    Raises `EncodeError` for an invalid mesh.
     """
     writer = CdrWriter()
     frames = subframes or {}
@@ -112,10 +112,10 @@ def encode_scene(
     frame_id: str = WORLD_FRAME,
     lifetime_ns: int = 0,
 ) -> bytes:
-    """A `foxglove_msgs/SceneUpdate`: the entities are shown, and those named in `deleted` are no longer.
+    """A `foxglove_msgs/SceneUpdate`: it shows the entities and removes those named in `deleted`.
 
     `stamp_ns` is the time of the deletions [ns]; viewers forget what isn't renewed for `lifetime_ns`, 0: never.
-    Raises `EncodeError` for vertices that aren't finite or too few, and a stamp that doesn't fit a ROS time.
+    Raises `EncodeError` for vertices that aren't finite, a wrong number of them, and a stamp that fits no ROS time.
     """
     writer = CdrWriter()
     writer.fields("I", len(deleted))

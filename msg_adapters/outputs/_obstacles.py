@@ -1,4 +1,4 @@
-"""Garments as MoveIt's planning scene has obstacles."""
+"""Garments as obstacles in MoveIt's planning scene."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class Obstacles(Output):
-    """Garments as MoveIt has obstacles: each message puts one in, whole, in the place of the one that was there.
+    """Garments as MoveIt obstacles: each message adds a whole one, replacing the one that was there.
 
-    So it doesn't matter who has missed what, or has begun anew: to `move` what isn't there would be an error. What
-    planners can't have is left out (`Fittings.without_planner`).
+    So it doesn't matter if a receiver has missed messages or restarted: to `move` what isn't there would be an error.
+    Garments that planners can't have are left out (`Fittings.without_planner`).
     """
 
     message_type = COLLISION_OBJECT
@@ -36,7 +36,7 @@ class Obstacles(Output):
         if not moment.watchers(self.topic):
             return
         if not all(_is_prepared(one.fittings, name) for one in worn for name in one.fittings.names):
-            return  # soon
+            return  # not before all are ready
         for one in worn:
             if not is_due(self._due, one.person, moment):
                 continue
@@ -70,5 +70,5 @@ class Obstacles(Output):
 
 
 def _is_prepared(fittings: Fittings, garment: str) -> bool:
-    """Whether it is known how planners have a garment, or that they can't."""
+    """Whether a garment's mesh for planners is ready, or known to be impossible."""
     return fittings.has_planner(garment) or garment in fittings.without_planner

@@ -15,7 +15,7 @@ from msg_adapters.errors import DecodeError, EncodeError
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 POINT_FIELDS = ("normal", "clearance", "sigma", "vertex", "garment", "visible")
-"""What a point may have besides its place."""
+"""What a point may have besides its position."""
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy's name of each of PointField's data types."""
@@ -30,7 +30,7 @@ class PointCloudEncoder:
     names them), `clearance` and `sigma` [m] (all float32), `vertex` (uint16, or uint32 where a garment has more
     vertices), `garment` (uint8: which of the garments, counted from 0) and `visible` (uint8: 1 where it is seen).
 
-    `counts` are the garments' vertices. One encoder serves one thread at a time.
+    `counts` are the garments' numbers of vertices. One encoder serves one thread at a time.
     """
 
     def __init__(
@@ -69,13 +69,13 @@ class PointCloudEncoder:
         offset: ArrayLike = (0.0, 0.0, 0.0),
         values: Mapping[str, Sequence[ArrayLike]],
     ) -> bytes:
-        """One frame; a garment's array each.
+        """Encode one frame; each sequence has one array per garment.
 
         Args:
             vertices: [m] in the axes of the frame, shape (V, 3) each.
             stamp_ns: time of the measurement [ns].
             offset: added to the vertices [m], shape (3,).
-            values: as far as `fields` has them: `normal`, shape (V, 3) each, `clearance` and `sigma` [m] and `visible`,
+            values: those that `fields` has of `normal`, shape (V, 3) each, `clearance` and `sigma` [m] and `visible`,
                 shape (V,) each.
 
         Raises `EncodeError` where a shape is wrong, something isn't finite, or the stamp doesn't fit a ROS time.
@@ -99,7 +99,7 @@ class PointCloudEncoder:
             with np.errstate(invalid="ignore", over="ignore"):
                 if values.ndim == 1:
                     target[part] = values
-                for k in range(values.shape[1] if values.ndim == 2 else 0):  # by columns: a fifth of what rows take
+                for k in range(values.shape[1] if values.ndim == 2 else 0):  # by columns: a fifth of the time of rows
                     np.add(values[:, k], offset[k], out=target[part, k], casting="same_kind")
                 # A sum is finite only if every term is: nothing is allocated.
                 is_finite = np.isfinite(values.sum() + offset.sum())
@@ -110,7 +110,7 @@ class PointCloudEncoder:
 
 
 def _layout(fields: Sequence[str], *, most_vertices: int) -> np.dtype[Any]:
-    """Numbers of four bytes first, so that all lie at multiples of their size."""
+    """A point's dtype: numbers of four bytes come first, so that all lie at multiples of their size."""
     columns = [(name, "<f4") for name in "xyz"]
     if "normal" in fields:
         columns += [(f"normal_{axis}", "<f4") for axis in "xyz"]
@@ -131,8 +131,8 @@ def _columns(points: NDArray[Any], first: str) -> NDArray[np.float32]:
 def points_of(message: Any) -> NDArray[Any]:
     """The points of a `sensor_msgs/PointCloud2` object of rclpy, as a structured array over its memory.
 
-    Of an organised cloud they come row by row; where its rows are padded, they are copied. Raises `DecodeError` for
-    fields or rows that aren't in the data.
+    Those of an organised cloud come row by row; if its rows are padded, they are copied. Raises `DecodeError` if fields
+    or rows aren't in the data.
     """
     fields = message.fields
     (height, width), (step, row_step) = (message.height, message.width), (message.point_step, message.row_step)

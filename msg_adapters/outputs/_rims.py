@@ -15,7 +15,7 @@ from msg_adapters.transforms import Transform, encode_transforms, quaternion_fro
 
 POLYGON = "geometry_msgs/msg/PolygonStamped"
 _COLOR, _WIDTH_M = (0.95, 0.55, 0.1, 1.0), 0.004
-"""Of the lines."""
+"""Colour and width of the lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Rim:
     """Where one opening of a garment is, in the axes of a header's frame."""
 
     name: str
-    """Of the marker's namespace and of the frame: `[<person>/]<garment>/<opening>`."""
+    """Name of the marker's namespace and of the frame: `[<person>/]<garment>/<opening>`."""
     stamp_ns: int
     centre: NDArray[np.float64]
     """[m], shape (3,)."""
@@ -45,9 +45,9 @@ def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = WORLD_FRAM
 
 
 def encode_rims(rims: Sequence[Rim], *, frame_id: str = WORLD_FRAME, lifetime_ns: int = 0) -> bytes:
-    """A MarkerArray with a LINE_STRIP a rim, closed; the marker's pose is the opening's frame, its points lie in that.
+    """A MarkerArray with one closed LINE_STRIP per rim; its pose is the opening's frame, and its points lie in that.
 
-    Raises `EncodeError` for what can't be drawn.
+    Raises `EncodeError` for rims that can't be drawn.
     """
     strips = []
     for rim in rims:
@@ -59,7 +59,7 @@ def encode_rims(rims: Sequence[Rim], *, frame_id: str = WORLD_FRAME, lifetime_ns
 
 
 def encode_frames(rims: Sequence[Rim], *, frame_id: str = WORLD_FRAME) -> bytes:
-    """A `tf2_msgs/TFMessage` with a frame a rim. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
+    """A `tf2_msgs/TFMessage` with one frame per rim. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
     return encode_transforms(
         [Transform(rim.stamp_ns, frame_id, rim.name, rim.centre, quaternion_from_matrix(rim.rotation)) for rim in rims]
     )

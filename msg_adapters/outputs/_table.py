@@ -1,4 +1,4 @@
-"""The topics that come of dressed people: a table of what each is called, holds, and is made of."""
+"""The topics about dressed people: a table of each one's name, its type, and how it is made."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GARMENTS, BODY, OPENINGS = "garments", "body", "openings"
 
 
 def _token(name: str) -> str:
-    """A garment's name as topics may have it."""
+    """A garment's name in a form that topics allow."""
     word = re.sub(r"\W", "_", name, flags=re.ASCII)
     return word if word[:1].isalpha() else f"garment_{word}"
 
@@ -122,7 +122,7 @@ def _encode_points(layouts: Layouts, one: DressedPerson, _: Any, moment: Moment)
 
 
 def _encode_contacts(one: DressedPerson, _: Any, moment: Moment) -> bytes:
-    """A status each two parts: geometry, from which no force follows."""
+    """One status per pair of parts: geometry, from which no force follows."""
     statuses = []
     for contact in one.contacts():
         x, y, z = one.turned(contact.centre) + one.offset

@@ -1,4 +1,4 @@
-"""How topics come of dressed people: one of all, or one of each, made only where somebody wants it."""
+"""How topics are made of dressed people: one for all or one for each, made only where somebody wants it."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ if TYPE_CHECKING:
     from refu_core.outputs import DressedPerson, Fittings
 
 _MOST_LAID_OUT = 64
-"""People in all layouts that are kept, but for one of more; of each a layout has the bytes, and takes a millisecond."""
+"""The most people in all kept layouts together; one alone may have more. For each person a layout holds the message's
+bytes and takes a millisecond to make."""
 Messages = Iterator[tuple[str, bytes]]
-"""Topics, and what is to be sent there."""
+"""Topics, each with what is to be sent there."""
 
 
 class Moment(NamedTuple):
-    """What an output has to know besides the people."""
+    """What an output needs to know besides the people."""
 
     frame_id: str
-    """Of every header."""
+    """Frame of every header."""
     lifetime_ns: int
     """Viewers forget what isn't renewed for so long [ns]; 0: never."""
     points_fields: Sequence[str]
-    """What points have besides their place, of `POINT_FIELDS`."""
+    """Those of `POINT_FIELDS` that points have."""
     planner_rate: float
-    """Meshes for planners, at most so many a second; 0 for no limit [Hz]."""
+    """Highest rate of meshes for planners; 0 for no limit [Hz]."""
     watchers: Callable[[str], int]
-    """How many want a topic."""
+    """How many listen to a topic."""
     now_ns: int
 
 
@@ -40,30 +41,30 @@ class Output:
     message_type: str
 
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:
-        """Where it goes for these people in these garments; None: before anything is known of them."""
+        """Its topics for these people in these garments; None: before anything is known of the garments."""
         raise NotImplementedError
 
     def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
-        """What is to be sent of one tick, and where; nothing is computed for a topic that nobody wants."""
+        """What one tick sends, and where; nothing is computed for a topic that nobody wants."""
         raise NotImplementedError
 
     def gone(self, persons: Sequence[str], moment: Moment) -> Messages:  # noqa: ARG002
-        """What tells viewers that somebody has left."""
+        """Messages that tell viewers that somebody has left."""
         return iter(())
 
     def forget(self) -> None:
-        """Other garments are worn from now on, or other people wear them."""
+        """To be called when other garments are worn from now on, or other people wear them."""
 
 
 class Layouts:
-    """Message layouts, kept as long as the same is to be laid out."""
+    """Message layouts that are kept for reuse, up to `_MOST_LAID_OUT` people."""
 
     def __init__(self) -> None:
         self._known: dict[Any, Any] = {}
         self._n_people = 0
 
     def get(self, key: Any, make: Callable[[], Any], *, n_people: int = 1) -> Any:
-        """What `make` makes, of so many people, or made the last time."""
+        """The layout kept for `key`, or else what `make` makes, for `n_people`."""
         if key not in self._known:
             if self._n_people + n_people > _MOST_LAID_OUT:
                 self.clear()
@@ -77,13 +78,13 @@ class Layouts:
 
 
 class Together(Output):
-    """One message of all people on one topic, in which each thing has a name: viewers are told which of them have gone.
+    """One message of all people on one topic, in which each thing has a name: viewers are told which names have gone.
 
     Args:
         topic, message_type: of the output.
         names: of the things of one person.
-        encode: all of them, as one message.
-        delete: the message that takes names away.
+        encode: makes one message of all people's things.
+        delete: makes the message that removes names.
     """
 
     def __init__(
@@ -124,13 +125,13 @@ class Together(Output):
 
 @dataclass
 class Apart(Output):
-    """A topic for each person, and for each part of what they wear: nobody has to be told that it has gone.
+    """A topic for each person, and for each part of what they wear: nobody needs to be told that one has gone.
 
     Args:
         message_type: of the output.
-        places: topics below the person's, each with what `encode` is told.
-        encode: one message of one person.
-        slow: of planners' meshes, what `encode` is told being the garment: no more than `planner_rate` a second.
+        places: topics below the person's name, each with an argument for `encode`.
+        encode: makes one message of one person.
+        slow: whether these are planners' meshes, at most `planner_rate` a second; the argument is then the garment.
     """
 
     message_type: str
@@ -138,7 +139,7 @@ class Apart(Output):
     encode: Callable[[DressedPerson, Any, Moment], bytes]
     slow: bool = False
     due: dict[str, float] = field(default_factory=dict)
-    """When each topic of planners' meshes is next."""
+    """When each topic of planners' meshes is due next."""
 
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:
         if fittings is None:
@@ -159,7 +160,7 @@ class Apart(Output):
 
 
 def is_due(due: dict[str, float], key: str, moment: Moment) -> bool:
-    """Whether so much time has gone by; if so, it begins anew. Nothing is kept of what is due: people leave."""
+    """Whether `key` is due at the planner's rate; if so, its wait begins anew. What is due isn't kept: people leave."""
     now = time.monotonic()
     for passed in [name for name, at in due.items() if at <= now]:
         del due[passed]

@@ -1,4 +1,4 @@
-"""A smooth field over a garment, known at some of its vertices: what few samples can tell needs no more numbers."""
+"""A smooth field over a garment, stored at some of its vertices: what few samples can tell needs no more numbers."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from refu_core.mesh import Connectivity
 _HOLD = 100.0
 """How much more a control's own value weighs than the smoothness at a vertex."""
 _NEVER_SINGULAR = 1e-9
-"""A piece of cloth without a control doesn't move."""
+"""Keeps the matrix from being singular: a piece of cloth without a control doesn't move."""
 
 
 @dataclass(frozen=True, eq=False)
 class Controls:
-    """Vertices of a garment whose values say those of all others: smooth, as a least-squares mesh is.
+    """Vertices of a garment whose values determine those of all others, smoothly, as in a least-squares mesh.
 
     Sorkine and Cohen-Or (2004): each vertex is the mean of its neighbours, as far as the controls' values allow.
     """
@@ -35,7 +35,7 @@ class Controls:
 
     @classmethod
     def of(cls, garment: GarmentTemplate, vertices: Tensor) -> Controls:
-        """Of these vertices (C,). Raises `WeightsError` where they aren't vertices of the garment, each once."""
+        """With these vertices (C,). Raises `WeightsError` unless they are vertices of the garment, each once."""
         numbers = vertices.tolist() if vertices.ndim == 1 and not vertices.is_floating_point() else []
         inside = bool(numbers) and 0 <= min(numbers) <= max(numbers) < garment.n_vertices
         if not inside or len(set(numbers)) < len(numbers):
@@ -46,7 +46,7 @@ class Controls:
 
     @classmethod
     def spread(cls, garment: GarmentTemplate, count: int) -> Controls:
-        """`count` of them, each new one where the way along the cloth to all before it is longest."""
+        """`count` controls, each new one where it is farthest along the cloth from all before it."""
         points, (first, second) = garment.v_template.cpu().double().numpy(), garment.mesh.edges.T
         length = np.linalg.norm(points[first] - points[second], axis=1)
         graph = sparse.csr_array((length, (first, second)), (len(points), len(points)))
@@ -57,7 +57,7 @@ class Controls:
         return cls(garment.mesh, torch.tensor(chosen, dtype=torch.int32))
 
     def __call__(self, values: Tensor) -> Tensor:
-        """The field at all vertices, float32, shape (N, V, K), of its values at the controls (N, C, K)."""
+        """The field at all vertices, float32, shape (N, V, K), from its values at the controls (N, C, K)."""
         n_fields, n_controls, width = values.shape
         n, at = self.mesh.n_vertices, self.vertices.numpy()
         bend = self.mesh.uniform_laplacian()
@@ -65,7 +65,7 @@ class Controls:
         hold[at] += _HOLD
         known = np.zeros((n, n_fields * width))
         known[at] = _HOLD * values.detach().cpu().double().numpy().transpose(1, 0, 2).reshape(n_controls, -1)
-        # Symmetric, and positive: that is told, or the factors are several times as large.
+        # The matrix is symmetric and positive; unless the solver is told so, its factors are several times as large.
         solver = splu(
             (bend.T @ bend + sparse.diags(hold)).tocsc(),
             permc_spec="MMD_AT_PLUS_A",
@@ -76,5 +76,5 @@ class Controls:
         return field.view(n, n_fields, width).transpose(0, 1).contiguous()
 
     def matrix(self) -> Tensor:
-        """What each control is worth at each vertex, shape (V, C)."""
+        """The weight of each control at each vertex, shape (V, C)."""
         return self(torch.eye(len(self.vertices))[None])[0]

@@ -1,4 +1,4 @@
-"""The product of a few codes with a basis, which libraries for matrices are slow at: they are made for many rows."""
+"""The product of a few codes with a basis; matrix libraries are slow at that, as they are made for many rows."""
 
 from typing import TYPE_CHECKING
 
@@ -7,9 +7,9 @@ import warp as wp
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 
 WIDTH = 16
-"""Columns of a strip: with four codes as many sums as a processor with 16 registers of eight numbers keeps in them."""
+"""Columns of a strip: with four codes, as many sums as a CPU with 16 registers of eight numbers can keep in them."""
 ROWS = wp.constant(4)
-"""Codes that a strip is multiplied by at a time."""
+"""How many codes a strip is multiplied by at a time."""
 
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def decode_kernel(
 ) -> None:
     """One strip of mean + code @ basis, of codes (B, R); `coarse` (S, K) and `fine` (S, R - K) are the basis' rows.
 
-    A `step` (R - K) is what one of `fine` is worth.
+    Each `step` (R - K) is the size of one unit of `fine`.
     """
     s = wp.tid()
     whole = coarse.shape[1]

@@ -17,10 +17,10 @@ from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 
 _A_FEW = 16
-"""From more codes on, a product of matrices is the faster way."""
+"""For more codes than this, a product of matrices is faster."""
 _WHOLE = 32
-"""Components in half precision. Bytes for the others move a garment by 0.06 mm on recorded motion, 0.5 mm at most; with
-16 it is 0.11 and 0.8 mm, with 64 0.03 and 0.3, and a garment's basis takes a third more."""
+"""Components in half precision; the others are bytes, which moves a garment by 0.06 mm on recorded motion, 0.5 mm at
+most. With 16 it is 0.11 and 0.8 mm; with 64 it is 0.03 and 0.3 mm, but a garment's basis takes a third more."""
 _STEPS = 127
 
 
@@ -42,26 +42,26 @@ class DenseDecoder(nn.Module):
         return displacement.flatten(1)
 
     def directions(self, garment: GarmentTemplate) -> Tensor:
-        """What a unit of each of (β, γ) does to the template, in codes [m], shape (14, 3 V)."""
+        """How a unit of each of (β, γ) changes the template, as codes [m], shape (14, 3 V)."""
         return _template_directions(garment)
 
 
 class BasisDecoder(nn.Module):
     """The code is in an orthonormal basis of displacements (preset `realtime`): a head of R columns, not of 3 V.
 
-    All networks of a garment share the basis, so it is stored once, and the product with it, most of what a frame
-    costs, is made once for the sum of all networks. The first components, which say most, are stored in half
+    All networks of a garment share the basis. So it is stored once, and the product with it, which is most of a frame's
+    cost, is computed once for the sum of all networks. The first components, which matter most, are stored in half
     precision, the others as whole numbers of steps, -127 to 127. Distances between codes are distances between
     garments: |code - code'|² = Σ_v |D_v - D'_v|², up to rounding.
 
-    A basis of few samples is smooth. It is stored at `controls`, a hundredth of the bytes or less, and is that of all
-    vertices from when it is loaded on.
+    A basis made from few samples is smooth. It is stored at `controls`, in a hundredth of the bytes or less, and is
+    expanded to all vertices when it is loaded.
     """
 
     def __init__(self, mean: Tensor, components: Tensor, *, controls: Controls | None = None) -> None:
         """`mean` [m], shape (V, 3), and orthonormal rows `components`, shape (R, 3 V).
 
-        With `controls` both are given there, (C, 3) and (R, 3 C), and orthonormal is what they say of all vertices.
+        With `controls` both are given at those, (C, 3) and (R, 3 C), and are orthonormal once expanded to all vertices.
         """
         super().__init__()
         if components.ndim != 2 or components.shape[1] != mean.numel():
@@ -80,7 +80,7 @@ class BasisDecoder(nn.Module):
         self.n_vertices = len(mean)
         self.size = len(components)
         """Width R of a code."""
-        # What is computed with is what is stored, or codes wouldn't mean the same before and after.
+        # Computes with the numbers as they are stored; otherwise codes would change their meaning when saved.
         self.register_buffer("mean", mean.half().float().flatten())
         self.register_buffer("components", _Stored.of(components.float()).components())
         self.mean: Tensor
@@ -89,7 +89,7 @@ class BasisDecoder(nn.Module):
 
     @classmethod
     def of_tensors(cls, tensors: Mapping[str, Tensor], garment: GarmentTemplate | None = None) -> BasisDecoder:
-        """Of what a basis file holds: the inverse of `tensors`. One at controls is that of a `garment`.
+        """From what a basis file holds: the inverse of `tensors`. A basis at controls needs its `garment`.
 
         Raises `WeightsError` where something is missing, or parts don't fit each other or the garment.
         """
@@ -120,7 +120,7 @@ class BasisDecoder(nn.Module):
         return (displacement.flatten(1) - self.mean) @ self.components.T
 
     def directions(self, garment: GarmentTemplate) -> Tensor:
-        """What a unit of each of (β, γ) does to the template, isometrically to the vertices [m], shape (14, R + 14).
+        """How a unit of each of (β, γ) changes the template, in coordinates isometric to vertices [m], (14, R + 14).
 
         The first R columns are in the basis, the others in an orthonormal basis of what lies outside of it.
         """
@@ -130,7 +130,7 @@ class BasisDecoder(nn.Module):
         return torch.cat((inside, outside), 1)
 
     def is_stored_as(self, tensors: Mapping[str, Tensor]) -> bool:
-        """Whether this is the basis of a file that holds `tensors`. Raises `WeightsError` as `of_tensors`."""
+        """Whether this is the basis of a file that holds `tensors`. Raises `WeightsError` as `of_tensors` does."""
         if "controls" not in tensors:
             return torch.equal(BasisDecoder.of_tensors(tensors).components, self.components.cpu())
         own = self.tensors()
@@ -153,20 +153,20 @@ class _Stored(NamedTuple):
     fine: Tensor
     """The others in steps, int8, shape (R - K, 3 V)."""
     steps: Tensor
-    """What a step of each of those is worth, rounded to bfloat16, shape (R - K,)."""
+    """The size of a step of each of those, rounded to bfloat16, shape (R - K,)."""
 
     @classmethod
     def of(cls, components: Tensor) -> _Stored:
-        """Of components (R, 3 V). Of those that were stored before it is what was stored, to the bit."""
+        """From components (R, 3 V). For components that were stored before, it gives what was stored, to the bit."""
         rest = components[_WHOLE:]
         largest = rest.abs().amax(1) if len(rest) else rest.new_zeros(0)
-        # 127 of them have few enough digits for float32, so the largest one says what the step was.
+        # 127 steps have few enough digits for float32, so the largest component tells what the step was.
         steps = (largest / _STEPS).bfloat16().float()
         fine = (rest / steps.clamp_min(torch.finfo().tiny)[:, None]).round().clamp(-_STEPS, _STEPS)
         return cls(components[:_WHOLE].half().float(), fine.to(torch.int8), steps)
 
     def components(self) -> Tensor:
-        """As numbers, float32, shape (R, 3 V). Raises `WeightsError` for parts that don't fit each other."""
+        """Components as numbers, float32, shape (R, 3 V). Raises `WeightsError` for parts that don't fit each other."""
         sizes = (self.coarse.shape[1:], self.fine.shape[:1], self.fine.dtype)
         if self.coarse.ndim != 2 or sizes != (self.fine.shape[1:], self.steps.shape, torch.int8):
             shapes = ", ".join(str(tuple(part.shape)) for part in self)
@@ -176,9 +176,9 @@ class _Stored(NamedTuple):
 
 
 class _Strips:
-    """A basis in strips of some columns, each in one piece of memory: for the codes of a few persons, on a CPU.
+    """A basis in strips of some columns, each contiguous in memory: for the codes of a few persons, on a CPU.
 
-    The basis is then read once for all of them, and the product takes hardly longer than that of one.
+    The basis is then read once for all persons, and the product takes hardly longer than for one.
     """
 
     def __init__(self, mean: Tensor, components: Tensor) -> None:
@@ -203,7 +203,7 @@ _decode = Repeated(decode_kernel, (wp.float32, Strip, Steps, wp.float32, Strip, 
 
 
 def _in_strips(rows: Tensor) -> Tensor:
-    """Rows (N, C) as strips (S, N, WIDTH), the last of which ends with zeros."""
+    """Rows (N, C) as strips (S, N, WIDTH), the last one padded with zeros."""
     padded = functional.pad(rows, (0, -rows.shape[1] % WIDTH))
     return padded.view(len(rows), padded.shape[1] // WIDTH, WIDTH).transpose(0, 1).contiguous()
 

@@ -1,4 +1,4 @@
-"""A backbone that knows how a person moves: what cloth owes to its inertia, added to what it does at rest."""
+"""A backbone that knows how a person moves: the effect of cloth's inertia, added to how it hangs at rest."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ class DynamicsConfig:
     """Sizes of the perceptron."""
 
     joints: tuple[int, ...]
-    """Those whose motion it sees, the root's among them."""
+    """Those whose motion it sees; the root is always one of them."""
     hidden: tuple[int, ...] = (256, 256)
     activation: str = "silu"
     dropout: float = 0.2
 
 
 class Dynamics(nn.Module):
-    """f(θ, β, γ, past) - f(θ, β, γ, 0): zero for whoever stands still, whatever was learnt.
+    """f(θ, β, γ, past) - f(θ, β, γ, 0): zero for a person who stands still, whatever was learnt.
 
     It has no state, so it can't drift.
     """
 
     def __init__(self, config: DynamicsConfig, still: TailorNet) -> None:
-        """`still` is what it is added to."""
+        """`still` is the backbone that this one is added to."""
         super().__init__()
         self.config = config
         joints = (0, *(j for j in config.joints if j))
@@ -45,7 +45,7 @@ class Dynamics(nn.Module):
         groups = still.features.groups
         now = torch.cat((groups[self._now], groups[still.features.size :])).numpy()
         self.groups = torch.from_numpy(np.concatenate((now, np.tile(now.max() + 1 + columns // 9, len(LAGS)))))
-        """Which inputs belong together, as `PoseFeatures.groups`: of all lags those of a joint."""
+        """Which inputs belong together, as in `PoseFeatures.groups`: those of one joint, at all lags."""
         n_past = len(LAGS) * len(columns)
         n, m = len(self._now) + N_STYLE_SHAPE + n_past, still.decoder.size
         self.net = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
@@ -64,7 +64,7 @@ class Dynamics(nn.Module):
         return past[..., self._columns].flatten(1)
 
     def standardise(self, x: Tensor, s: Tensor, past: Tensor, is_bounded: Tensor) -> None:
-        """Takes the inputs' sizes from the training set; which of x and s `is_bounded` says, the past always is."""
+        """Takes the inputs' sizes from the training set; `is_bounded` is for x and s, the past is always bounded."""
         moved = self.seen(past)
         bounded = (is_bounded[self._now], is_bounded[x.shape[1] :], torch.ones(moved.shape[1], dtype=torch.bool))
         inputs = torch.cat((x[:, self._now], s, moved), 1)
@@ -72,7 +72,7 @@ class Dynamics(nn.Module):
 
 
 class Dynamic(nn.Module):
-    """A TailorNet, and `Dynamics` on top: one output basis for both, so hardly more than the one alone."""
+    """A TailorNet with `Dynamics` on top: both share an output basis, so it costs hardly more than the first alone."""
 
     heeds_past = True
 
@@ -82,7 +82,7 @@ class Dynamic(nn.Module):
 
     @property
     def decoder(self) -> nn.Module:
-        """Of both."""
+        """The decoder of both."""
         return self.still.decoder
 
     def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor:
@@ -98,7 +98,7 @@ class Dynamic(nn.Module):
         wearer_code: Tensor | None = None,
         past: Tensor | None = None,
     ) -> Tensor:
-        """Predicts as the TailorNet does and, where it is told the past (B, 4, 219), for moving cloth."""
+        """Predicts as the TailorNet does and, if given the past (B, 4, 219), adds the effect of motion."""
         x, s = self.still.features(pose), style_shape(betas, style)
         code = self.still.code(x, s, wearer_code)
         if past is not None:

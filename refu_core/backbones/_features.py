@@ -15,23 +15,23 @@ N_STYLE_SHAPE = N_BETAS + N_STYLES
 """Width of (β, γ)."""
 
 _CARRIES = 0.05
-"""Mean weight that a joint has in skinning the cloth it carries: hips have .03 of a T-shirt's and .34 of shorts',
-elbows .07 of a shirt's. With hips bounded, too, a T-shirt was 27 mm inside somebody who squats, and cut the shorts."""
+"""Least mean skinning weight of a joint in the cloth that it carries: hips have .03 in a T-shirt and .34 in shorts,
+elbows .07 in a shirt. With hips bounded, too, a T-shirt was 27 mm inside a squatting person, and cut the shorts."""
 
 ENCODINGS: tuple[str, ...] = ("matrix", "rotvec")
 
 
 def up_in_root(pose: Tensor) -> Tensor:
-    """World up as the root sees it, unit, shape (B, 3), of poses (B, 24, 3) [rad].
+    """World up in the root's axes, of unit length, shape (B, 3), for poses (B, 24, 3) [rad].
 
-    All that cloth can know of the root's rotation: it tilts gravity, and the heading changes nothing.
+    This is all of the root's rotation that matters to cloth: it tilts gravity, and the heading changes nothing.
     """
     return rotvec_to_rotmat(pose[:, 0])[:, 1]
 
 
 SEEN_TILT = (np.radians(40), np.radians(60))
-"""No training clip tilts the pelvis beyond the first of these [rad], and networks are told of no more than the second.
-Of somebody who lies, a skirt was off by 30 to 46 mm and a T-shirt by 15 to 23; with this by 32 to 44 and 12 to 18."""
+"""No training clip tilts the pelvis beyond the first of these [rad], and networks are told of none beyond the second.
+On a lying person, a skirt was off by 30 to 46 mm and a T-shirt by 15 to 23; with this, by 32 to 44 and 12 to 18."""
 _MOST_TILT = 0.5
 """The cosine of the second."""
 
@@ -39,7 +39,7 @@ _MOST_TILT = 0.5
 def told_up(up: Tensor) -> Tensor:
     """`up` (B, 3), of unit length, tilted by 60° at most.
 
-    Beyond 120° the tilt falls again: who stands on their hands is told as upright, or a touch would turn it over.
+    Beyond 120° the tilt falls again: a handstand is told as upright; otherwise a slight change could turn it over.
     """
     x, y, z = up.unbind(-1)
     sine2 = 1 - _MOST_TILT**2
@@ -52,7 +52,7 @@ def told_up(up: Tensor) -> Tensor:
 def tilt_rotvec(up: Tensor) -> Tensor:
     """The smallest rotation that turns `up` to +y, as a rotation vector [rad]; both of the shape (B, 3).
 
-    This is a root's rotation without its heading. Half a turn has no axis of its own: any in the plane will do there.
+    This is a root's rotation without its heading. A half turn has no unique axis: any in the x-z plane will do there.
     """
     x, y, z = up.unbind(-1)
     sine = (x * x + z * z).clamp_min(1e-12).sqrt()
@@ -62,9 +62,9 @@ def tilt_rotvec(up: Tensor) -> Tensor:
 
 
 def upright(pose: Tensor, up: Tensor) -> Tensor:
-    """Poses (B, 24, 3) [rad] as a network sees them that knows y as up, where `up` (B, 3), of unit length, is up.
+    """Poses (B, 24, 3) [rad], in whose axes `up` (B, 3), of unit length, is up, for a network that takes y as up.
 
-    Roots are without heading then. Those that have y up stay as they are, bit for bit.
+    Roots lose their heading. Poses with y up stay as they are, bit for bit.
     """
     of_root = (rotvec_to_rotmat(pose[:, 0]).mT @ up[..., None])[..., 0]
     root = torch.where(up[:, 1:2] == 1, pose[:, 0], tilt_rotvec(of_root))
@@ -103,20 +103,20 @@ class PoseFeatures(nn.Module):
         self._eye: Tensor
 
     def columns_of(self, joints: tuple[int, ...]) -> Tensor:
-        """Which numbers of the features are of these joints, and of up. Raises `ValueError` for one that it lacks."""
+        """Which of the features belong to these joints and to up. Raises `ValueError` for a joint that it lacks."""
         if self.encoding != "matrix":
             return torch.arange(self.size)
         first = [3 + 9 * self.joints.index(joint) for joint in joints if joint != 0]
         return torch.cat([torch.arange(3), *(torch.arange(at, at + 9) for at in first)])
 
     def are_bounded(self, garment: GarmentTemplate) -> Tensor:
-        """Which numbers of (features, β, γ) a network of a garment should see within their range alone, (size + 14,).
+        """Which numbers of (features, β, γ) a garment's network should see only within their known range, (size + 14,).
 
-        Beyond it, skinning takes cloth along with the joints that carry it. A hem that raised thighs push hangs on
-        other joints: there what the network makes of it is all there is.
+        Beyond that range, skinning takes cloth along with the joints that carry it. But a hem that raised thighs push
+        is carried by other joints: there only the network can move it.
         """
         carries = garment.weights.detach().cpu().mean(0) >= _CARRIES
-        carries[0] = False  # up is limited already (`told_up`); bounded, it cost a skirt 0.4 mm on its test samples
+        carries[0] = False  # up is limited already (`told_up`); bounding it cost a skirt 0.4 mm on its test samples
         joints = self._index.cpu() if self.encoding == "matrix" else torch.arange(24)
         return torch.cat((carries[joints[self.groups[: self.size]]], torch.ones(N_STYLE_SHAPE, dtype=torch.bool)))
 

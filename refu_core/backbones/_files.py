@@ -34,9 +34,9 @@ def save_basis(folder: Path, basis: BasisDecoder, card: Mapping[str, Any]) -> Pa
 
 
 def require_basis(folder: Path, digest: str | None, *, written: Sequence[str]) -> None:
-    """Raises `WeightsError` where another basis would be taken from under weights that aren't `written` anew.
+    """Raises `WeightsError` if a new basis would replace that of weights in the folder that aren't `written` anew.
 
-    The basis that will be there has this `digest`; None is one that no weights there know.
+    The new basis has this `digest`; None for one that no weights in the folder were trained with.
     """
     for path in sorted(folder.glob("*.json")):
         if path.stem in (*written, "basis"):
@@ -49,7 +49,7 @@ def require_basis(folder: Path, digest: str | None, *, written: Sequence[str]) -
 
 
 def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:
-    """The output basis of a garment and its hash. Raises `WeightsError` as `refu_core.weights.load_weights`."""
+    """The output basis of a garment and its hash. Raises `WeightsError` as `refu_core.weights.load_weights` does."""
     weights = load_weights(folder / "basis", expect=expect)
     try:
         basis = BasisDecoder.of_tensors(weights.tensors, garment)
@@ -70,7 +70,7 @@ def save_backbone(
     """Writes a backbone, without its basis, and its card: `stem` with suffixes; the basis lies in the same folder.
 
     The card says `garment`, `body_fingerprint`, and whatever else is known. `others` are tensors that belong with it,
-    the ReFU layer's for instance, with another prefix. By `half` the parameters are stored in half precision.
+    the ReFU layer's for instance, with another prefix. With `half` the parameters are stored in half precision.
 
     Raises `WeightsError` for weights that aren't finite or can't be written, and for another basis in the folder.
     """
@@ -91,7 +91,7 @@ def save_backbone(
 def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Network:
     """The backbone in `weights`, with the basis beside them, in float32 and ready for use (`eval`).
 
-    Raises `WeightsError`: of another version or garment, or the basis is missing, damaged or another one.
+    Raises `WeightsError`: they are for another version or garment, or their basis is missing, damaged or replaced.
     """
     card, template = weights.card, garment.to(device="cpu")
     config = config_from_card(str(card.get("backbone")), card.get("config"))
@@ -114,7 +114,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
         rest = memory(1, N_BETAS, device=device), memory(1, N_JOINTS, 3, device=device)
         at_rest = module(*rest, None)
     offset = 0.0 if at_rest is None else float(at_rest.abs().max())
-    if not offset <= MAX_OFFSET:  # nor NaN
+    if not offset <= MAX_OFFSET:  # also refuses NaN
         msg = f"{weights.path}: wanted a garment within {MAX_OFFSET:g} m of a body at rest, this one is "
         msg += f"{offset:.3g} m off; train it again"
         raise WeightsError(msg)
@@ -122,7 +122,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
 
 
 def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> Path:
-    """Writes what a garment owes to motion, `folder`/dynamics. Raises `WeightsError`, too, where there is no basis."""
+    """Writes a garment's dynamics, `folder`/dynamics. Raises `WeightsError` also if there is no basis."""
     basis = load_weights(folder / "basis", expect={"garment": card["garment"]})
     described = {"config": asdict(dynamics.config), "basis_sha256": str(basis.card["sha256"])}
     parameters = dict(dynamics.named_parameters())
@@ -131,9 +131,9 @@ def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> 
 
 
 def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
-    """What the backbone `name` is: what was made of `weights`, with the dynamics beside them where it wants those.
+    """The backbone `name`: the `network` made from `weights`, with the dynamics beside them if it wants those.
 
-    Raises `WeightsError`: they aren't of a tailornet, or there are no dynamics, damaged ones, or some for another
+    Raises `WeightsError`: the network isn't a tailornet, or the dynamics are missing, damaged, or made for another
     basis.
     """
     there = weights.path.with_name("dynamics.json").exists()
@@ -186,14 +186,14 @@ def load_backbone(
 
 
 def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:
-    """What `load_backbone` makes its backbone of, None for `skinned`, and `auto` where none ship. Raises as it does."""
+    """The weights that `load_backbone` uses; None for `skinned`, and for `auto` if none ship. Raises as it does."""
     kind = BackboneName.of(name, "backbone", error=WeightsError)
     mode = SdfMode.of(mode, "mode of a backbone", error=WeightsError)
     shipped = weights_folder(garment)
     folder = shipped if folder is None else folder
-    nothing_ships = folder == shipped and not shipped.exists()  # weights that were named have to be there
+    nothing_ships = folder == shipped and not shipped.exists()  # in a folder that was named there must be some
     if kind is BackboneName.SKINNED or (kind is BackboneName.AUTO and nothing_ships):
         return None
-    if kind in (BackboneName.AUTO, BackboneName.DYNAMIC):  # which is one, and more
+    if kind in (BackboneName.AUTO, BackboneName.DYNAMIC):  # `dynamic` is a tailornet, and more
         kind = BackboneName.TAILORNET
     return load_weights(folder / f"{kind}-{mode}", expect={"garment": garment})

@@ -1,4 +1,4 @@
-"""Frequency division (Patel et al. 2020): what Laplacian smoothing leaves of a garment, and what it takes."""
+"""Frequency division (Patel et al. 2020): what Laplacian smoothing leaves of a garment, and what it takes away."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ STEP_SIZE = 0.15
 class LaplacianSmoothing:
     """Moves vertices towards the mean of their neighbours; those at a border along the border only.
 
-    All garments are smoothed unposed, the skirt too, which the original smooths posed: so smoothing is one linear map
-    of displacements and can be applied to a basis of them instead of to every sample.
+    All garments are smoothed unposed, even the skirt, which the original smooths posed. So smoothing is one linear map
+    of displacements, and can be applied to a basis of them instead of to every sample.
     """
 
     def __init__(self, garment: GarmentTemplate) -> None:

@@ -31,7 +31,7 @@ class GcnnConfig:
     hidden: tuple[int, ...] = (256, 256)
     """Hidden layers of the perceptron before the mesh."""
     channels: tuple[int, ...] = (9, 32, 16, 16)
-    """Of the coarsest graph first; every layer but the last one goes up a level, to three channels at the end."""
+    """Those of the coarsest graph first; every layer goes up a level, and the last one ends with three channels."""
     bases: int = 8
     """M, the number of shared weight matrices that a vertex' own coefficients mix."""
     residual: float = 0.5
@@ -59,7 +59,7 @@ class Neighbours:
     """For each vertex of one graph, some vertices of another one or of the same."""
 
     index: NDArray[np.int64]
-    """Shape (V_out, n); where there are fewer than n, the last ones are repeated and not valid."""
+    """Shape (V_out, n); where there are fewer than n, the last one is repeated, and not valid."""
     valid: NDArray[np.bool_]
     """Shape (V_out, n)."""
 
@@ -84,7 +84,7 @@ class MeshGraph:
     sizes: tuple[int, ...]
     """Vertices of each of the L + 1 levels."""
     ups: tuple[Neighbours, ...]
-    """From level l + 1 to level l: the coarse vertices that a fine one hears, shape (V_l, n)."""
+    """From level l + 1 to level l: the coarse vertices that each fine one depends on, shape (V_l, n)."""
 
     @staticmethod
     def of(mesh: Connectivity, *, levels: int, stride: int = 2) -> MeshGraph:
@@ -152,7 +152,7 @@ class UpConv(nn.Module):
         self.across = nn.Linear(inputs, outputs, bias=False) if inputs != outputs else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Shape (V_coarse, B, I) -> (V_fine, B, O): what a neighbour hands over lies in one piece."""
+        """Shape (V_coarse, B, I) -> (V_fine, B, O): what a neighbour hands over is contiguous in memory."""
         n_out, n = self.index.shape
         bases, inputs, outputs = self.basis.shape
         batch = x.shape[1]
@@ -172,8 +172,8 @@ class UpConv(nn.Module):
 class Gcnn(WithoutWearerCode, nn.Module):
     """A mesh decoder conditioned on (θ, β, γ).
 
-    The original is an autoencoder of meshes, and there is no mesh to encode at run time: how (θ, β, γ) enter is this
-    project's choice. A perceptron fills the latent of the coarsest graph.
+    The original is an autoencoder of meshes, but at run time there is no mesh to encode. How (θ, β, γ) enter is this
+    project's choice: a perceptron fills the latent of the coarsest graph.
     """
 
     def __init__(self, config: GcnnConfig, garment: GarmentTemplate) -> None:

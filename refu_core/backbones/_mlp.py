@@ -25,7 +25,7 @@ class MlpConfig:
 
     @classmethod
     def paper(cls, joints: tuple[int, ...]) -> MlpConfig:
-        """Dense head; the paper doesn't give the width, TailorNet's is taken."""
+        """With a dense head. The paper doesn't give the width, so TailorNet's is used."""
         return cls(joints, "rotvec", (1024, 1024, 1024, 1024), "relu", 0.2)
 
 

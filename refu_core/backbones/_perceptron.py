@@ -15,11 +15,11 @@ ACTIVATIONS = {"relu": functional.relu, "silu": functional.silu}
 
 
 class _Standardised(nn.Module):
-    """What brings its inputs to one size; they are left as they are until `standardise`.
+    """Scales its inputs to a common size; until `standardise` is called they stay as they are.
 
-    Where an input is bounded, it sees nothing beyond what the training set had. A perceptron's answer goes on in
-    straight lines where nothing was learnt: with the legs 47° apart, beyond any sample, a skirt was 51 mm inside the
-    thighs, and is 34 mm with this. Cloth of there is that of the nearest known pose, posed anew.
+    A bounded input is clamped to its range in the training set. Beyond what it has learnt, a perceptron extrapolates
+    linearly: with the legs 47° apart, beyond any sample, a skirt was 51 mm inside the thighs, and is 34 mm with this.
+    Out there, cloth is that of the nearest known pose, posed anew.
     """
 
     shift: Tensor
@@ -36,7 +36,7 @@ class _Standardised(nn.Module):
         self.register_buffer("highest", torch.full((inputs,), _ANY))
 
     def standardise(self, inputs: Tensor, groups: Tensor | None = None, *, is_bounded: Tensor | bool = True) -> None:
-        """Takes range, shift and scale from the inputs of the training set (N, I); one scale a group (I,) of inputs.
+        """Takes range, shift and scale from the inputs of the training set (N, I); one scale per group (I,).
 
         `is_bounded` (I,) says which inputs are clamped to their range.
         """
@@ -45,15 +45,15 @@ class _Standardised(nn.Module):
             getattr(self, name).copy_(values)
 
     def widen(self, inputs: Tensor) -> None:
-        """Takes in the range of further samples (N, I), where inputs are clamped; shift and scale stay as they are."""
+        """Widens the range of clamped inputs by further samples (N, I); shift and scale stay as they are."""
         with torch.no_grad():
             self.lowest.copy_(torch.where(self.lowest > -_ANY, inputs.amin(0).minimum(self.lowest), -_ANY))
             self.highest.copy_(torch.where(self.highest < _ANY, inputs.amax(0).maximum(self.highest), _ANY))
 
     def take_in(self, inputs: Tensor, groups: Tensor, *, at: int) -> None:
-        """Takes further inputs at the place `at`, which say nothing yet; range and sizes are those of samples (N, J).
+        """Inserts further inputs before number `at`, with no effect yet; range and sizes are those of samples (N, J).
 
-        They are clamped: no skinning goes on from there, as no joint that carries the cloth comes later.
+        They are clamped. Joints that are added later don't carry the cloth, so beyond the range skinning adds nothing.
         """
         for name, values in _measured(inputs, groups, is_bounded=True).items():
             setattr(self, name, _inserted(getattr(self, name), values, at))
@@ -64,7 +64,7 @@ class _Standardised(nn.Module):
         raise NotImplementedError
 
     def seen(self, x: Tensor) -> Tensor:
-        """The inputs (B, I) as the first layer has them."""
+        """The inputs (B, I) as the first layer sees them."""
         return (x.clamp(self.lowest, self.highest) - self.shift) * self.scale
 
 
@@ -105,7 +105,7 @@ class StackedPerceptrons(_Standardised):
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for a, b in pairwise((inputs, *hidden, outputs)):
-            bound = a**-0.5  # as nn.Linear
+            bound = a**-0.5  # as in nn.Linear
             self.weights.append(nn.Parameter(torch.empty(count, a, b).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.empty(count, b).uniform_(-bound, bound)))
 
@@ -121,17 +121,17 @@ class StackedPerceptrons(_Standardised):
             h = self.activation(torch.baddbmm(bias[:, None], h, weight))
             h = functional.dropout(h, self.dropout) if self.training else h
         weight, bias = layers[-1]
-        # Mixing before the last layer makes one product of it, and no (K, B, O) array, large with dense heads.
+        # Mixing before the last layer turns it into one product, without a (K, B, O) array, large with dense heads.
         mixed = (h * mixture.T[..., None]).transpose(0, 1).flatten(1)  # (B, K * H)
         return torch.addmm(mixture @ bias, mixed, weight.flatten(0, 1))
 
 
 @torch.no_grad()
 def _measured(inputs: Tensor, groups: Tensor, is_bounded: Tensor | bool) -> dict[str, Tensor]:
-    """Range, shift and scale of the inputs (N, I) of samples; one scale a group (I,) of them."""
+    """Range, shift and scale of the inputs (N, I) of samples; one scale per group (I,)."""
     bounded = torch.as_tensor(is_bounded, device=inputs.device)
-    # Within a group the sizes stay as they are: what of a joint's rotation hardly varies says little, and isn't blown
-    # up to the size of the rest. The same for groups that don't vary at all.
+    # Within a group relative sizes stay as they are: a number of a joint's rotation that hardly varies says little, and
+    # isn't blown up to the size of the rest. The same holds for groups that don't vary at all.
     variance = inputs.new_zeros(int(groups.max()) + 1).index_add(0, groups, inputs.var(0))
     return {
         "lowest": torch.where(bounded, inputs.amin(0), -_ANY),
@@ -142,5 +142,5 @@ def _measured(inputs: Tensor, groups: Tensor, is_bounded: Tensor | bool) -> dict
 
 
 def _inserted(values: Tensor, new: Tensor, at: int) -> Tensor:
-    """Values (…, I) with new ones (…, J) before number `at`."""
+    """Values (…, I) with new ones (…, J) inserted before number `at`."""
     return torch.cat((values[..., :at], new, values[..., at:]), -1)

@@ -71,12 +71,12 @@ def build_backbone(
 
 
 def backbone_name(config: BackboneConfig) -> str:
-    """The name of the backbone of such a configuration."""
+    """The name of the backbone that has this configuration."""
     return next(name for name, kind in _CONFIGS.items() if isinstance(config, kind))
 
 
 def config_from_card(name: str, values: Any) -> BackboneConfig:
-    """The configuration that a card has as `values`. Raises `WeightsError` for none of the backbone `name`."""
+    """The configuration that a card has as `values`. Raises `WeightsError` unless it fits the backbone `name`."""
     if name not in _CONFIGS:
         msg = f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again"
         raise WeightsError(msg)

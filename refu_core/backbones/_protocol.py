@@ -7,7 +7,7 @@ from typing import Protocol
 from torch import Tensor
 
 MAX_OFFSET = 2.0
-"""No vertex is further from where the template has it [m], whatever a network says; as in the data it learns from."""
+"""No vertex is farther than this from its place in the template [m], whatever a network says; as in training data."""
 
 
 class Backbone(Protocol):
@@ -19,7 +19,7 @@ class Backbone(Protocol):
         ...
 
     def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor | None:
-        """What depends on betas (B, 10) and style (B, 4) only, shape (B, K): to be computed once a person.
+        """What depends on betas (B, 10) and style (B, 4) only, shape (B, K): to be computed once per person.
 
         None where there is no such thing.
         """
@@ -30,14 +30,14 @@ class Backbone(Protocol):
     ) -> Tensor | None:
         """What is added to the garment's template in the T-pose [m], shape (B, V, 3); None for nothing.
 
-        For betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4). Given the `wearer_code` of (β, γ), it isn't computed
-        again. One that heeds the past takes it as `past`, too, of the shape (B, 4, 219).
+        For betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4). The `wearer_code` of (β, γ) isn't computed again if
+        given. A backbone that heeds the past takes that, too, as `past` of the shape (B, 4, 219).
         """
         ...
 
 
 class WithoutWearerCode:
-    """A backbone that computes all of a frame anew, of that frame alone."""
+    """A backbone that computes each frame anew, from that frame alone."""
 
     heeds_past = False
 

@@ -108,10 +108,10 @@ class TailorNet(nn.Module):
     def mixture(self, s: Tensor) -> Tensor:
         """Ψ, shape (B, K), of (β, γ) (B, 14); rows sum to one however far a style is from all pivots.
 
-        Not differentiable: the kernel is so narrow that its gradient is nothing nearly everywhere and huge elsewhere.
+        Not differentiable: the kernel is so narrow that its gradient is zero nearly everywhere and huge elsewhere.
         """
-        # Far from all pivots, which of two is nearer hangs on the last digits of distances of 1e5: float32 hasn't got
-        # them, and a pivot's weight would be rounding.
+        # Far from all pivots, which of two is nearer depends on the last digits of distances of 1e5: float32
+        # lacks these, and a pivot's weight would be rounding noise.
         return kernel_weights(self.distances(s.double()), self.config.sigma).to(s.dtype)
 
 

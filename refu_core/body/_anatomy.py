@@ -1,4 +1,4 @@
-"""What `Collider` knows of a body, prepared once from its file: as its kernels and as its derivative take it."""
+"""What `Collider` knows of a body, prepared once from its file, in the forms that kernels and torch code take."""
 
 from __future__ import annotations
 
@@ -27,52 +27,52 @@ DEFAULT_GAP = 0.012
 
 
 FADE = 0.035
-"""Beyond the reach of a crease its planes let skin go by a metre a metre; so far out nothing would be held [m]."""
+"""Skin farther beyond a crease's reach than this isn't held [m]: out there the kept height falls by 1 m per metre."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColliderSettings:
-    """How a body is pulled apart. `benchmarks/sensitivity.py` measures what half and twice of each number do."""
+    """How a body is pulled apart. `benchmarks/sensitivity.py` measures what halving and doubling each number does."""
 
     gap: float = DEFAULT_GAP
     """Room that is left between two parts [m]."""
     crease_share: float = 0.5
-    """Share of its height over a seam in the rest pose that skin keeps, at most half of the gap: nothing moves until a
-    fold has squeezed skin to half."""
+    """Share of its rest-pose height over a seam that skin keeps, at most half of the gap: nothing moves until a fold
+    has squeezed skin to half of that height."""
     crease_reach: float = 0.045
-    """Skin up to this far from a seam keeps to its side [m], and skin beyond it less and less. Farther out segments
-    find each other by their distance, and share what is to be given way in halves, which a plane doesn't."""
+    """Skin up to this far from a seam is kept on its side [m], and skin beyond that less and less. Farther out segments
+    are parted by their distance instead: each gives way by its half, which a plane doesn't provide for."""
     segment_share: float = 0.6
-    """Share of its distance from another segment in the rest pose that skin keeps, at most the gap: at a joint
-    segments are 0 apart. Half of it leaves 93 % of recorded frames free of intersections, in place of 97 %."""
+    """Share of its rest-pose distance from another segment that skin keeps, at most the gap: at a joint segments are
+    0 apart. Half this value leaves 93 % of recorded frames free of intersections, instead of 98 %."""
     farthest: float = 0.035
-    """No skin gives way by more than this [m]. Where two parts overlap by more than twice as much they still do: no
-    flesh gives way to a pose that no body can take."""
+    """No skin gives way by more than this [m]. Parts that overlap by more than twice as much still overlap afterwards:
+    flesh doesn't give way to a pose that no body can take."""
     thin: float = 0.4
-    """Nor farther than this share of what is below it: a finger gives way by millimetres, and isn't turned over."""
+    """Nor by more than this share of the thickness below it: a finger gives way by millimetres, and isn't inverted."""
     aside_farthest: float = 0.07
-    """No arm goes aside by more than this [m]. Recorded motion is of slim people: on a body with 4.5 cm wider hips, 101
-    of 116 T-shirts and 108 shorts are free with 35 mm, 105 and 112 with 50 mm, 108 and 113 with 70 mm."""
+    """No arm moves aside by more than this [m]. Recorded motion is of slim people: on a body with 4.5 cm wider hips,
+    101 of 116 T-shirts and 108 shorts are free with 35 mm, 105 and 112 with 50 mm, 108 and 113 with 70 mm."""
     aside_rounds: int = 3
-    """Newton's steps of an arm out of the body."""
+    """Newton steps that bring an arm out of the body."""
     crease_rounds: int = 2
-    """How often skin is brought to its side: at the groin several seams meet."""
+    """How often skin is brought to its side of the seams: at the groin several of them meet."""
     part_rounds: int = 4
-    """Newton's steps to the surface between two segments."""
+    """Newton steps to the surface between two segments."""
     deepen_rounds: int = 8
-    """How far inside another segment skin is looked for [edges], from where its surface is within the gap."""
+    """How far inside another segment skin is looked for [edges], starting from skin within the gap of its surface."""
     smooth_first: int = 3
-    """Sweeps over creases before segments are parted."""
+    """Smoothing sweeps over creases, before segments are parted."""
     smooth_last: int = 1
-    """Sweeps over all that was moved after it."""
+    """Smoothing sweeps over all skin that was moved, after that."""
     smooth_full: float = 0.004
-    """Skin that was moved this far is levelled in full [m], and the less the less it was moved."""
+    """Skin that was moved this far is levelled in full [m]; skin that was moved less is levelled less."""
     smooth_step: float = 0.5
-    """How far a sweep goes towards the mean of the neighbours."""
+    """Share of the way to the mean of its neighbours that a sweep moves a vertex."""
     edge_rounds: int = 2
-    """How often the middles of edges are brought out: a triangle cuts the corner between its vertices."""
+    """How often the midpoints of edges are pushed out: a triangle cuts the corner between its vertices."""
     steep: float = 0.004
-    """Edges whose ends were moved by this much apart from each other are looked at [m], in full from twice that on."""
+    """Edges whose ends' moves differ by more than this are pushed out [m], in full from twice that on."""
 
 
 class Anatomy:
@@ -86,7 +86,7 @@ class Anatomy:
         mesh = Connectivity.of(body.faces.cpu(), len(rest))
         mesh.require_closed()
         self.mesh = mesh
-        """What is next to what on the body."""
+        """The connectivity of the body's mesh."""
         self.edges = torch.as_tensor(mesh.edges.astype(np.int64), device=self.device)
         """Shape (E, 2)."""
         self.weights = torch.as_tensor(weights, device=self.device)
@@ -101,7 +101,7 @@ class Anatomy:
         self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
         self.aside = Aside(body, mesh, farthest=settings.aside_farthest, rounds=settings.aside_rounds)
-        """Arms out of what isn't an arm."""
+        """Brings arms out of the rest of the body."""
         self.work = self.memory.work
         self.work.farthest = as_warp(self.farthest, wp.float32)
 
@@ -142,7 +142,7 @@ class Anatomy:
         least = np.minimum(how.gap / 2, how.crease_share * found.height) - beyond
         seams.least = self._floats(least)
         self.creases, self.least = found, torch.as_tensor(least, device=self.device)
-        """What is held by which seam, and the height over its plane that is kept [m], shape (R,)."""
+        """Which skin each seam holds, and the height over its plane that is kept [m], shape (R,)."""
         seams.stations = wp.array(found.stations.astype(np.int32), dtype=kernels.Stations, device=str(self.device))
         seams.weights = wp.array(
             found.weights.astype(np.float32), dtype=kernels.StationWeights, device=str(self.device)
@@ -155,7 +155,7 @@ class Anatomy:
         return seams
 
     def _thickness(self, rest: NDArray[np.float64], mesh: Connectivity) -> torch.Tensor:
-        """How far it is to the skin on the other side [m], the least of each vertex and those around it, (V,)."""
+        """Distance to the skin on the other side [m], the least over each vertex and its neighbours, shape (V,)."""
         device, points = str(self.device), self._vectors(rest)
         body = wp.Mesh(points, self._ints(mesh.faces.ravel()))
         across = wp.zeros(len(rest), dtype=wp.float32, device=device)
@@ -187,7 +187,7 @@ class Anatomy:
         segments.path = self._ints(_paths(weights, solids.of_vertex))
         clearance = wp.zeros((n, n_segments), dtype=wp.float32, device=device)
         segments.gap = clearance
-        most = how.gap / max(how.segment_share, 1e-3)  # whoever is farther keeps the whole gap
+        most = how.gap / max(how.segment_share, 1e-3)  # skin farther away keeps the whole gap
         wp.launch(parting.clearance_kernel, (n, n_segments), [most, points, segments, clearance], device=device)
         segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
         self.bundles = bundled(points.numpy(), solids.faces, self.device)
@@ -195,15 +195,15 @@ class Anatomy:
         self.own = torch.as_tensor(solids.of_vertex.astype(np.int64), device=self.device)
         """The segment of each vertex, shape (V,)."""
         self.faces = torch.as_tensor(faces.astype(np.int64), device=self.device)
-        """Of all segments, one after another, into vertices and the middles of caps, shape (F, 3)."""
+        """Faces of all segments, one after another, indexing vertices and the middles of caps, shape (F, 3)."""
         self.kept, self.ratio = wp.to_torch(segments.gap), wp.to_torch(segments.ratio)
-        """What vertices keep from segments [m], shape (V, K), and how many times as soft segment k is as i, (K, K)."""
+        """What vertices keep from segments [m], shape (V, K), and how many times as soft k is as i, shape (K, K)."""
         return segments
 
     def _bind_skins(self, gap: NDArray[np.float32]) -> Any:
-        """The vertices of the bundles; each vertex (V, K) that keeps a `gap` is in the first one that has it.
+        """Shares vertices out among bundles, each to the first one that has it; `gap` (V, K) is what they keep [m].
 
-        A thread takes a piece: of a CPU, what is one bundle's; of a GPU, one vertex.
+        A thread takes one piece: on a CPU all vertices of a bundle, on a GPU a single vertex.
         """
         start, corner = self.bundles.start.numpy(), self.bundles.corner.numpy()
         is_free = np.ones(len(gap), np.bool_)
@@ -235,7 +235,7 @@ class Anatomy:
 
 
 class Memory:
-    """What a call works in, as torch sees it and, as `work`, the kernels."""
+    """The memory that a call works in: as torch tensors and, in `work`, as kernels take it."""
 
     def __init__(self, n_vertices: int, n_middles: int, n_edges: int, n_rounds: int, device: torch.device) -> None:
         self.rotation = memory(len(PARENTS), 3, 3, device=device)
@@ -245,7 +245,7 @@ class Memory:
         by_vertex = ("is_moved", "is_end", "is_front", "touched", "outside")
         n_ints = len(by_vertex) * n_vertices
         self.ints = memory(n_ints + kernels.FRONT + n_rounds + 1, dtype=torch.int32, device=device)
-        """What every call begins with as zeros."""
+        """All that is set to zero at the start of every call."""
         self.counts = self.ints[n_ints:]
         self.work = work = kernels.Work()
         for name in ("skin", "points", "here", "there"):
@@ -262,16 +262,16 @@ class Memory:
         work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(device))
 
     def take(self, skin: torch.Tensor) -> None:
-        """Takes over a posed body (V, 3) [m]."""
+        """Copies a posed body (V, 3) [m] in."""
         self.places[:, : len(self.skin)] = skin
 
 
 def _paths(weights: NDArray[np.float64], of_vertex: NDArray[np.int32]) -> NDArray[np.int32]:
     """The joints, as bits, that move any skin of segment i against any of segment k, shape (K, K).
 
-    Of skinning weights (V, 24) and the segment of each vertex.
+    From skinning weights (V, 24) and the segment of each vertex.
     """
-    # Each joint and those that it hangs on, but the root, which moves all.
+    # For each joint the bits of itself and its ancestors, without the root, which moves everything.
     above = CARRIED[:, 1:].astype(np.int64) @ (1 << np.arange(1, len(PARENTS)))
     move = [above[(weights[of_vertex == k] > 0).any(axis=0)] for k in range(len(SOFTNESS))]
     return np.array(

@@ -1,4 +1,4 @@
-"""Arms that are inside the body go aside, before skin gives way."""
+"""Moves arms that are inside the body aside, before skin gives way."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from refu_core.mesh import Connectivity, linked
 Array = NDArray[np.float64]
 
 _SLICES = 24
-"""Slices of a forearm with its hand: one in 2 cm, as thick as a finger."""
+"""Slices of a forearm with its hand: one every 2 cm, as thick as a finger."""
 _FEWEST = 4
-"""A piece of fewer vertices has no middle."""
+"""A piece with fewer vertices gets no middle."""
 _FOREARMS = (joints_of("left_forearm"), joints_of("right_forearm"))
 
 
 class Aside:
     """Swings arms about their shoulders until no middle of a forearm, palm, finger or thumb is inside the body.
 
-    Flesh gives way to what dents it, and not to what is wholly inside: each side of a hand would go its own way, and
-    the skin around it has no reason to go any. Cloth that goes around a hip would have to go through the arm. And a
-    thumb bores a hole that is narrower than cloth's triangles. What has its middle outside is inside by half of its
-    thickness at most, so it is a dent.
+    Flesh gives way to what dents it, but not to what is wholly inside: the two sides of a hand would move apart, and
+    the skin around it has no reason to move at all. Cloth around a hip would have to go through the arm. And a thumb
+    bores a hole narrower than the cloth's triangles. A part whose middle is outside is inside by half of its thickness
+    at most, so it is a dent.
 
-    Each middle that is inside asks for the least turn that brings it to the surface, and those that are deep are heard
-    most. So arms go continuously; where none is inside, nothing moves.
+    Each middle that is inside asks for the least turn that brings it to the surface, and deep ones count most. So arms
+    move continuously; where no middle is inside, nothing moves.
     """
 
     def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:
-        """Of a body of a closed `mesh`. No arm goes by more than `farthest` [m], in as many `rounds`."""
+        """For a body with a closed `mesh`. No arm moves by more than `farthest` [m], in `rounds` Newton steps."""
         self._farthest, self._rounds, self._device = farthest, rounds, body.device
         device = body.device
         rest, weights, joints = (
@@ -68,13 +68,13 @@ class Aside:
         self._weight = self._tensor(weight / np.bincount(row, weight)[row])
         self._arm = self._tensor(np.array(arm, np.int64))
         self._is_of = self._arm == torch.arange(len(ARMS), device=device)[:, None]
-        """Which of C middles are each arm's, shape (2, C)."""
+        """Which of the C middles belong to each arm, shape (2, C)."""
         self._share = self._tensor(share.T[:, :, None])
         """How much of a vertex moves with each arm, shape (2, V, 1)."""
         self._joints = [self._tensor(np.array(one, np.int64)) for one in ARMS]
         self._other = self._tensor(np.flatnonzero(solids.of_vertex == 0))
         self._faces = self._tensor(solids.faces[0].astype(np.int64))
-        """Of the body without its arms, closed, shape (F, 3)."""
+        """Faces of the body without its arms, closed, shape (F, 3)."""
         self._box = memory(2, 1, 3, device=device)
         self._corners = [as_warp(corner, wp.vec3) for corner in self._box]
         self._points = memory(len(rest) + len(rows) - self._first_cap, 3, device=device)
@@ -86,9 +86,9 @@ class Aside:
             self._look = self._recorded_look(mesh, weights)
 
     def __call__(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
-        """Of one body: skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms aside.
+        """One body's skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms moved aside.
 
-        Differentiable. On a CPU the very same tensors where nothing is inside; a GPU isn't asked.
+        Differentiable. Where nothing is inside a CPU returns the very same tensors; on a GPU that isn't checked.
         """
         if self._is_serial and not self._is_any_inside(skin):
             return skin, rotation
@@ -96,7 +96,7 @@ class Aside:
         shoulder = means[: len(ARMS)][self._arm]
         arm = means[len(ARMS) : self._first_cap] - shoulder
         points = torch.cat((skin, means[self._first_cap :]))
-        if not self._is_serial:  # a CPU has fitted box and tree to know that much
+        if not self._is_serial:  # on a CPU the check above has fitted box and tree
             self._box[:, 0] = torch.stack(skin.detach()[self._other].aminmax(dim=0))
             self._points.copy_(points.detach())
             with torch_stream(self._device):
@@ -126,7 +126,7 @@ class Aside:
         return means
 
     def _recorded_look(self, mesh: Connectivity, weights: Array) -> Any:
-        """What finds box, caps and `_places`, the middles, and counts those that are near the body in `_n_near`."""
+        """A launch that finds box, caps and middles (`_places`), and counts middles near the body (`_n_near`)."""
         body = [joints for joints, _ in SOFTNESS if not any(set(joints) & set(arm) for arm in ARMS)]
         part_of = part_of_faces(torch.from_numpy(weights), torch.from_numpy(mesh.faces).long(), [*body, *ARMS]).numpy()
         corners = [np.unique(mesh.faces[part_of == k]) for k in range(len(body)) if (part_of == k).any()]
@@ -143,9 +143,9 @@ class Aside:
         return recorded(kernels.near_kernel, 1, arguments, "cpu")
 
     def _is_any_inside(self, skin: Tensor) -> bool:
-        """Whether any middle is inside the body. First by boxes of its segments: no tree is asked where none is near.
+        """Whether any middle is inside the body. The tree is asked only if one is near the box of a segment.
 
-        Only of a CPU. Box and tree are those of `skin` where it is true.
+        Only for a CPU. Where this is true, box and tree have been fitted to `skin`.
         """
         self._points[: len(skin)].copy_(skin.detach())
         self._look.launch()
@@ -155,14 +155,14 @@ class Aside:
         return bool((self._inside(self._places)[0] >= 0).any())
 
     def _inside(self, at: Tensor) -> tuple[Tensor, Tensor]:
-        """The closest face of the body to each place (C, 3) [m], and the weights of its corners; -1 outside."""
+        """The body's closest face to each place (C, 3) [m], -1 for one outside, and the weights of its corners."""
         at = at.detach().float().contiguous()
         face, weights = torch.empty(len(at), dtype=torch.int32, device=self._device), torch.zeros_like(at)
         self._find((len(at),), at, face, weights)
         return face, weights
 
     def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
-        """From each place (C, 3) [m] to the surface, of those that are inside; zeros for others."""
+        """The way to the surface from each of the places (C, 3) [m] that is inside; zeros for the others."""
         face, known = self._inside(at)
         corners = points[self._faces[face.clamp_min(0).long()]]
         weights = known if is_plain(points) else weights_at(at, corners, known.to(at))
@@ -174,7 +174,7 @@ class Aside:
 
 
 def _pieces(rest: Array, mesh: Connectivity, is_fore: NDArray[np.bool_], along: Array) -> list[Array]:
-    """Which vertices each connected piece of a slice of a forearm and hand has, (V,) each: fingers are apart."""
+    """The vertices of each connected piece of each slice of a forearm and hand, (V,): fingers are separate pieces."""
     (on,) = np.nonzero(is_fore)
     height = rest[on] @ along
     slices = np.full(len(rest), -1)
@@ -186,7 +186,7 @@ def _pieces(rest: Array, mesh: Connectivity, is_fore: NDArray[np.bool_], along: 
 
 
 def _within(turn: Tensor, most: Tensor) -> Tensor:
-    """Turns (N, 3) [rad], none by more than `most` (N, 1)."""
+    """Turns (N, 3) [rad], each limited to an angle of `most` (N, 1)."""
     squared = (turn * turn).sum(1, keepdim=True)
     is_far = squared > most**2
     return torch.where(is_far, most / torch.where(is_far, squared, 1.0).sqrt() * turn, turn)

@@ -1,4 +1,4 @@
-"""Which places are inside the body."""
+"""Finds which places are inside the body."""
 
 import warp as wp
 
@@ -21,7 +21,7 @@ def near_kernel(
     high_of_all: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
-    """How many of the first means are in the box of any segment, counted for each; by one thread, as a CPU has it.
+    """Counts how often one of the first `n_middles` means is in the box of a segment; for a single thread of a CPU.
 
     The vertices of segment k's faces are `corner[segment_start[k]:segment_start[k + 1]]`. The other means close the
     body: they are appended to its skin.
@@ -59,14 +59,17 @@ def inside_kernel(
     face: wp.array[int],
     corners: wp.array[wp.vec3],
 ) -> None:
-    """The closest face of each point inside a mesh within a box, and the weights of its corners there; -1 outside."""
+    """Finds the mesh's closest face to each point inside of it, -1 for one outside, and the weights of its corners.
+
+    `low` and `high` are the mesh's box.
+    """
     i = wp.tid()
     p = points[i]
     face[i] = -1
     for c in range(3):
         if p[c] < low[0][c] or p[c] > high[0][c]:
             return
-    # Away from the middle of the box a ray is the soonest out of it, and meets few boxes of the tree.
+    # A ray that points away from the middle of the box leaves it soonest, and meets few boxes of the tree.
     side = wp.vec3(wp.where(p[0] < 0.5 * (low[0][0] + high[0][0]), -0.9418, 0.9418), 0.2389, 0.2361)
     if wp.mesh_query_ray_count_intersections(tree, p, side) % 2 == 1:
         hit = wp.mesh_query_point_no_sign(tree, p, 1.0e3)

@@ -1,4 +1,4 @@
-"""What is near what, by boxes: around bundles of some dozens of faces, and around groups of bundles such as limbs."""
+"""Finds what is near what, by boxes around bundles of some dozens of faces and around groups of bundles like limbs."""
 
 import warp as wp
 
@@ -12,21 +12,21 @@ class Bundles:
     """Groups of a posed mesh's faces, in bundles."""
 
     first: wp.array[int]
-    """Those of group k are `first[k]` to `first[k + 1]`."""
+    """The bundles of group k are `first[k]` to `first[k + 1]`."""
     start: wp.array[int]
     corner: wp.array[int]
     """The vertices of bundle i's faces are `corner[start[i]:start[i + 1]]`."""
     low: wp.array[wp.vec3]
     high: wp.array[wp.vec3]
-    """Their boxes."""
+    """The boxes of bundles."""
     group_low: wp.array[wp.vec3]
     group_high: wp.array[wp.vec3]
-    """Those of groups."""
+    """The boxes of groups."""
 
 
 @wp.func
 def lesser(p: wp.vec3, q: wp.vec3) -> wp.vec3:
-    """Without a look for NaN, as wp.min has."""
+    """The minimum of each coordinate, without the check for NaN that wp.min makes."""
     return wp.vec3(
         wp.where(q[0] < p[0], q[0], p[0]), wp.where(q[1] < p[1], q[1], p[1]), wp.where(q[2] < p[2], q[2], p[2])
     )
@@ -39,7 +39,7 @@ def greater(p: wp.vec3, q: wp.vec3) -> wp.vec3:
 
 @wp.func
 def bound(i: int, points: wp.array[wp.vec3], bundles: Bundles) -> None:
-    """The box of bundle i."""
+    """Finds the box of bundle i."""
     low = points[bundles.corner[bundles.start[i]]]
     high = low
     for c in range(bundles.start[i] + 1, bundles.start[i + 1]):
@@ -52,7 +52,7 @@ def bound(i: int, points: wp.array[wp.vec3], bundles: Bundles) -> None:
 
 @wp.func
 def enclose(k: int, bundles: Bundles) -> None:
-    """The box of group k; nothing is near one without faces."""
+    """Finds the box of group k; nothing is near a group without faces."""
     low = wp.vec3(wp.inf, wp.inf, wp.inf)
     high = -low
     for i in range(bundles.first[k], bundles.first[k + 1]):
@@ -76,7 +76,7 @@ def do_meet(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3
 
 @wp.func
 def is_near(low: wp.vec3, high: wp.vec3, k: int, gap: float, bundles: Bundles) -> bool:
-    """Whether what is in a box may be within `gap` [m] of group k."""
+    """Whether something in a box may be within `gap` [m] of group k."""
     if not do_meet(low, high, bundles.group_low[k], bundles.group_high[k], gap):
         return False
     for j in range(bundles.first[k], bundles.first[k + 1]):

@@ -1,4 +1,4 @@
-"""Bundles of faces that lie together, for kernels to see by boxes what is near what."""
+"""Bundles of neighbouring faces, whose boxes tell kernels what is near what."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from refu_core.body._bundle_kernels import Bundles
 from refu_core.mesh import grouped
 
 _SIZE = 64
-"""Faces of a bundle: with half as many, boxes take longer than they save."""
+"""Faces per bundle: with half as many, the boxes cost more time than they save."""
 
 
 def bundled(rest: NDArray[np.floating[Any]], faces: Sequence[NDArray[np.integer[Any]]], device: torch.device) -> Any:
-    """`Bundles` of groups of faces, (F_k, 3) each, which lie together in the pose `rest` (V, 3) [m]."""
+    """`Bundles` of groups of faces, (F_k, 3) each, bundled by how near they lie in the pose `rest` (V, 3) [m]."""
     corners: list[NDArray[np.integer[Any]]] = []
     first = [0]
     for of_group in faces:

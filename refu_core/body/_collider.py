@@ -21,18 +21,18 @@ from refu_core.body._model import SmplBody
 class Collider:
     """Gives way where a posed body runs through itself, as flesh does; the pose stays.
 
-    1. *Arms* that are inside the body by more than half of their thickness go aside as a whole (`Aside`).
+    1. *Arms* that are inside the body by more than half of their thickness move aside as a whole (`Aside`).
     2. *Creases.* Where a joint bends, skinning folds skin over itself. Skin is brought back to its own side of the
-       seams near by (`Creases`), along the normal of a plane that turns with the joint.
-    3. *Segments.* Parts that are in each other, or nearer than the gap, each give way until they are on their own side
-       of the surface half way between them, by the softness of each: ReFU with the distance of one part from the other.
-       Of no pair of parts can both then be at the same place.
-    4. Dents are levelled, and edges that cut their corners raised.
+       nearby seams (`Creases`), along the normal of a plane that turns with the joint.
+    3. *Segments.* Parts that overlap, or are nearer than the gap, each give way, according to their softness, until
+       they are on their own side of the surface half way between them: ReFU with the distance of one part from the
+       other. No two parts can then be at the same place.
+    4. Dents are levelled, and edges that cut corners are raised.
 
-    The result depends on the pose alone, not on the frames before, and continuously. Nothing moves where nothing is
-    near: skin keeps its distance only as far as it has one in the rest pose.
+    The result depends on the pose alone, not on earlier frames, and changes continuously with it. Nothing moves where
+    nothing is near: skin keeps no more distance than it has in the rest pose.
 
-    One call at a time: memory is kept from call to call.
+    Make one call at a time: memory is reused from call to call.
     """
 
     def __init__(self, body: SmplBody, *, gap: float = DEFAULT_GAP, settings: ColliderSettings | None = None) -> None:
@@ -60,8 +60,10 @@ class Collider:
         return self.apart(*self.aside(skin, transforms.rotation))
 
     def aside(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
-        """The first step: bodies `skin` [m], shape (B, V, 3), and their joints' `rotation` (B, 24, 3, 3) with arms
-        aside. Differentiable."""
+        """The first step: bodies `skin` [m], shape (B, V, 3), and joints' `rotation` (B, 24, 3, 3), arms moved aside.
+
+        Differentiable.
+        """
         if not len(skin):
             return skin, rotation
         found = [self.anatomy.aside(one, turn) for one, turn in zip(skin, rotation, strict=True)]
@@ -69,7 +71,7 @@ class Collider:
         return torch.stack(skins), torch.stack(turns)
 
     def apart(self, skin: Tensor, rotation: Tensor) -> Tensor:
-        """All other steps: bodies with arms `aside`, their joints' `rotation` and the result as there."""
+        """All other steps, on what `aside` returns; the bodies pulled apart [m], shape (B, V, 3)."""
         if not is_plain(skin, rotation):
             apart = [part_with_gradient(self, one, turn) for one, turn in zip(skin, rotation, strict=True)]
             return torch.stack(apart) if apart else torch.zeros_like(skin)
@@ -80,7 +82,7 @@ class Collider:
 
     @torch.no_grad()
     def _part(self, skin: Tensor, rotation: Tensor) -> Tensor:
-        """One body, in memory that the next one overwrites."""
+        """Pulls one body apart; the result may be in memory that the next call overwrites."""
         work = self.anatomy.memory
         work.rotation.copy_(rotation)
         work.ints.zero_()
@@ -95,7 +97,7 @@ class Collider:
         return self._parted
 
     def _touch(self) -> None:
-        """Which segments each vertex has to give way to."""
+        """Finds which segments each vertex has to give way to."""
         self._run("look")
         wanted = int(self.anatomy.memory.counts[kernels.WANTED]) if self._is_serial else -1
         refit([tree for k, tree in enumerate(self.anatomy.trees) if (wanted >> k) & 1], self.device)
@@ -108,14 +110,14 @@ class Collider:
 
     @property
     def _parted(self) -> Tensor:
-        """Where the last sweeps end."""
+        """The buffer that holds the result of the last sweeps."""
         work = self.anatomy.memory
         at: Tensor = work.here if self.settings.smooth_last % 2 == 0 else work.there
         return at
 
     @cached_property
     def _commands(self) -> dict[str, list[Any]]:
-        """Recorded launches."""
+        """Recorded launches, by step."""
         how, known = self.settings, self.anatomy
         work, bones, segments, rings = known.work, known.bones, known.segments, known.rings
         levelling = [how.smooth_full, how.smooth_step]
@@ -139,10 +141,10 @@ class Collider:
 
     @torch.no_grad()
     def shift(self, skin: Tensor, aside: Tensor, apart: Tensor) -> Tensor:
-        """How far bodies `skin` went with their arms `aside`, and `apart` from there, all (B, V, 3) [m], shape (B, 4).
+        """How far bodies moved from `skin` to `aside` to `apart`, each (B, V, 3) [m], as figures of shape (B, 4).
 
-        How many vertices moved; the largest and the mean of all ways [m]; and how many have gone as far as they may in
-        one of the two: there two parts may still be in each other, as deep as flesh doesn't give way to.
+        How many vertices moved; how far at most and on average [m]; and how many moved as far as they may in one of
+        the two steps: there two parts may still overlap, because flesh doesn't give way that far.
         """
         numbers = skin.new_zeros(len(skin), 4, dtype=torch.float32)
         n_strips, each = strips(skin.shape[1], self.device, at_least=IN_ROW)
@@ -155,7 +157,7 @@ class Collider:
         """Which segments each vertex of `skin` (V, 3) [m] has to give way to, bool, shape (V, K)."""
         self.anatomy.memory.ints.zero_()
         self.anatomy.memory.take(skin)
-        self.anatomy.memory.counts[kernels.BENT_JOINTS] = -1  # any may be
+        self.anatomy.memory.counts[kernels.BENT_JOINTS] = -1  # any joint may be bent
         with torch_stream(self.device):
             self._touch()
         bits: Tensor = wp.to_torch(self.anatomy.work.touched)
@@ -163,4 +165,4 @@ class Collider:
 
 
 _HELD = 0.99
-"""Share of the farthest that counts as all of it: levelling and edges come after, and move skin by a little."""
+"""Share of the farthest way that counts as all of it: levelling and edges come later, and move skin a little."""

@@ -1,4 +1,4 @@
-"""The collider in torch, with its derivative: kernels find what is closest to what, all else is computed anew."""
+"""The collider in torch, differentiable: kernels find the closest faces, and torch computes everything else again."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
 
 
 def _means(of: Any, points: Tensor) -> Tensor:
-    """Those that a `Means` has of points (V, 3) [m]."""
+    """The weighted means that a `Means` describes, of points (V, 3) [m]."""
     start, vertex, weight = (wp.to_torch(one) for one in (of.start, of.vertex, of.weight))
     n = len(start) - 1
     owner = torch.repeat_interleave(torch.arange(n, device=points.device), start.long().diff())
@@ -65,7 +65,7 @@ def _means(of: Any, points: Tensor) -> Tensor:
 
 
 def _within(p: Tensor, skin: Tensor, farthest: Tensor) -> Tensor:
-    """Points (V, 3) [m], or what is `farthest` (V,) [m] from the skin on the way to each of them."""
+    """Points (V, 3) [m], each pulled back to within `farthest` (V,) [m] of its skin."""
     away = p - skin
     squared = (away * away).sum(1, keepdim=True)
     farthest = farthest[:, None]
@@ -74,7 +74,7 @@ def _within(p: Tensor, skin: Tensor, farthest: Tensor) -> Tensor:
 
 
 def _between(rotation: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotations on the way from a joint's parent to it, one a level, (24 L, 3, 3), and how bent it is, (24 L,)."""
+    """Rotations between each joint's parent and the joint, one per level, (24 L, 3, 3), and how bent it is, (24 L,)."""
     above = rotation[[max(parent, 0) for parent in PARENTS]]
     turn = above.transpose(1, 2) @ rotation
     w = 0.5 * (1 + turn.diagonal(dim1=1, dim2=2).sum(1)).clamp_min(1e-6).sqrt()
@@ -107,7 +107,7 @@ def _crease_step(known: Anatomy, skin: Tensor, p: Tensor, between: Tensor, bent:
 
 def _smooth(known: Anatomy, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: int) -> Tensor:
     how, away = known.settings, p - skin
-    # Where nothing was moved the length's derivative has no direction.
+    # Where nothing was moved, the length has no derivative.
     length = torch.where(is_moved, (away * away).sum(1), 1.0).sqrt()
     share = torch.where(is_moved, (length / how.smooth_full).clamp_max(1) * how.smooth_step, 0.0)[:, None]
     start, ring = known.mesh.ring
@@ -131,7 +131,7 @@ def _ways_out(
     ratio: Tensor,
     keeps: Tensor,
 ) -> Tensor:
-    """How points (N, 3) [m] give way to a segment each, shape (N, 3); zeros where they needn't."""
+    """How each of the points (N, 3) [m] gives way to its own `segment`, shape (N, 3); zeros where it needn't."""
     face, about, sign = _closest(known, p, segment)
     corners = known.faces[face.clamp_min(0)]
     weights = weights_at(p, points[corners], about.to(p))
@@ -150,7 +150,7 @@ def _ways_out(
 
 @torch.no_grad()
 def _closest(known: Anatomy, points: Tensor, segment: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """What points (N, 3) [m] are closest to of a segment each (N,), in the pose that `touched` was asked for.
+    """Where each of the points (N, 3) [m] is closest to its own segment (N,), in the pose last given to `touched`.
 
     The face (N,), -1 for none near; the weights of its corners (N, 3); and the sign of the distance (N,), -1 inside.
     """
@@ -166,7 +166,10 @@ def _closest(known: Anatomy, points: Tensor, segment: Tensor) -> tuple[Tensor, T
 
 
 def weights_at(p: Tensor, corners: Tensor, about: Tensor) -> Tensor:
-    """Weights of a triangle's corners at its point closest to p, shape (N, 3), which is on what it is `about` on."""
+    """Weights of a triangle's corners at its point closest to p, shape (N, 3).
+
+    The rough weights `about` say whether that point is within the face, on an edge or at a corner.
+    """
     a, b, c = corners.unbind(1)
     is_on = about > _ON
     ab, ac, ap = b - a, c - a, p - a
@@ -211,9 +214,9 @@ def _edge_step(known: Anatomy, points: Tensor, normals: Tensor, start: Tensor, p
 
 
 def _together(steps: Tensor, owner: Tensor, n: int) -> Tensor:
-    """The steps (N, 3) of each owner as one, shape (n, 3): their mean by the square of their lengths.
+    """Combines the steps (N, 3) of each owner into one, shape (n, 3): their mean, weighted by squared length.
 
-    With the longest one alone the way would leap to another side where two are equally long.
+    Taking the longest step alone would make the direction jump where two are equally long.
     """
     squared = (steps * steps).sum(1, keepdim=True)
     total = steps.new_zeros(n, 1).index_add(0, owner, squared)
@@ -226,4 +229,4 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 _ON = 1e-6
-"""A closest point with less of a corner than this lies on the edge across."""
+"""A closest point that has a smaller weight than this at a corner lies on the opposite edge."""

@@ -1,6 +1,6 @@
-"""What pulls a posed body apart when no derivative is asked for: memory, creases and levelling, vertex by vertex.
+"""Kernels that pull a posed body apart when no derivative is needed: memory, creases and levelling, vertex by vertex.
 
-Segments are told apart by the bits of an integer. `touched` has the segments that a vertex has to give way to.
+A set of segments is stored as the bits of an integer. `touched` holds the segments that a vertex has to give way to.
 """
 
 import math
@@ -17,7 +17,7 @@ N_LEVELS = len(LEVELS)
 STRAIGHT = wp.constant(math.cos(0.05))
 """Cosine of half the angle up to which a joint folds no skin: 0.1 rad."""
 BENT = wp.constant(math.cos(0.15))
-"""The same of 0.3 rad, from where on its seams hold in full."""
+"""The same for 0.3 rad, from which on the joint's seams hold in full."""
 if TYPE_CHECKING:
     Stations = wp.Vector[int]
     StationWeights = wp.Vector[float]
@@ -41,7 +41,7 @@ def shift_kernel(
     # output
     numbers: wp.array2d[float],
 ) -> None:
-    """`Collider.shift`, `each` vertices a thread; `numbers` are zero before."""
+    """Computes `Collider.shift`, `each` vertices per thread; `numbers` must be zero before."""
     b, strip = wp.tid()
     n_moved = float(0.0)
     largest = float(0.0)
@@ -66,24 +66,24 @@ class Bones:
     """A posed body's joints, and how skin hangs on them."""
 
     rotation: wp.array[wp.mat33]
-    """Of each joint."""
+    """Rotation of each joint."""
     between: wp.array[wp.mat33]
-    """Of each joint's seams, between the parent's rotation and the joint's."""
+    """Rotation of each of a joint's seams, between the parent's rotation and the joint's."""
     bent: wp.array[float]
     """How much each joint's seams hold: not at all where it is straight."""
     start: wp.array[int]
     joint: wp.array[int]
     weight: wp.array[float]
     normal: wp.array[wp.vec3]
-    """Of the skin in the rest pose, smoothed."""
+    """Normals of the skin in the rest pose, smoothed."""
     parent: wp.array[int]
     levels: wp.array[float]
-    """Of the seams of a joint."""
+    """Levels of the seams of a joint."""
 
 
 @wp.struct
 class Seams:
-    """The rows of `Creases`, those of `vertex[i]` from `start[i]` on."""
+    """The rows of `Creases`; those of `vertex[i]` begin at `start[i]`."""
 
     vertex: wp.array[int]
     start: wp.array[int]
@@ -97,7 +97,7 @@ class Seams:
 
 @wp.struct
 class Means:
-    """Points that are weighted means of others, mean i of those from `start[i]` on."""
+    """Points that are weighted means of others; the rows of mean i begin at `start[i]`."""
 
     start: wp.array[int]
     vertex: wp.array[int]
@@ -107,47 +107,47 @@ class Means:
 
 @wp.struct
 class Work:
-    """Memory that a call works in; lists are as long as `counts` says."""
+    """The memory that a call works in; `counts` holds the lengths of the lists."""
 
     skin: wp.array[wp.vec3]
     points: wp.array[wp.vec3]
     """Skin without creases, then the middles of caps."""
     here: wp.array[wp.vec3]
     there: wp.array[wp.vec3]
-    """What sweeps go to and fro between."""
+    """The two buffers that sweeps alternate between."""
     farthest: wp.array[float]
     """How far skin may be moved [m]."""
     share: wp.array[float]
     """How much of a sweep each vertex of `moved` takes."""
     moved: wp.array[int]
     near: wp.array[int]
-    """Vertices in a bundle that another segment is near to."""
+    """Vertices that may be within the gap of another segment, by its boxes."""
     boxed: wp.array[int]
-    """Segments that are near the bundle of each of `near`."""
+    """Those segments, for each vertex of `near`."""
     touching: wp.array[int]
-    """Vertices in `touched`."""
+    """Vertices with segments in `touched`."""
     front: wp.array2d[int]
-    """Those of them that are new in each round that looks deeper."""
+    """Vertices that got new segments in `touched`: at first, then in each round that looks deeper."""
     hot: wp.array[int]
-    """Edges with an end in `touched`."""
+    """Edges with an end in `touching`."""
     ends: wp.array[int]
     """Vertices of those edges."""
     is_moved: wp.array[int]
     is_end: wp.array[int]
-    """Whether a vertex is in `ends`; if it was moved with its edges, 2 and the last round in which it was."""
+    """1 for a vertex in `ends`; once it was moved with its edges, 2 plus the last round in which it was."""
     is_front: wp.array[int]
     """The last round in whose front a vertex was, counted from 1."""
     touched: wp.array[int]
     outside: wp.array[int]
     parted: wp.array[wp.vec3]
-    """Where each vertex in `touched` was brought by the distances from segments, before it was levelled."""
+    """Where each vertex in `touching` was moved to by giving way to segments, before it was levelled."""
     reach: wp.array[float]
-    """How far from there the surfaces of those segments are at most [m]."""
+    """Upper bound of the distance from there to the surfaces of those segments [m]."""
     steps: wp.array[wp.vec3]
-    """Of each edge."""
+    """The step of each edge."""
     counts: wp.array[int]
-    """How many are in `moved`, `near`, `touching`, `hot` and `ends`; as bits the segments that are asked for distances,
-    and the joints that are bent; how many are in each row of `front`."""
+    """Lengths of `moved`, `near`, `touching`, `hot` and `ends`; as bits, the segments whose distances are needed and
+    the joints that are bent; the length of each row of `front`."""
 
 
 MOVED = wp.constant(0)
@@ -162,18 +162,18 @@ FRONT = wp.constant(7)
 
 @wp.struct
 class Rings:
-    """What is around each vertex: vertices, and edges with their ends."""
+    """The neighbours of each vertex, and the edges of the mesh."""
 
     start: wp.array[int]
     vertex: wp.array[int]
     edge: wp.array[int]
-    """The edge to each of them."""
+    """The edge to each neighbour."""
     ends: wp.array[wp.vec2i]
 
 
 @wp.kernel
 def between_kernel(work: Work, bones: Bones) -> None:
-    """The rotations on the way from each joint's parent to the joint, one a seam, and which joints are bent."""
+    """Finds the rotations between each joint's parent and the joint, one per seam, and which joints are bent."""
     j = wp.tid()
     above = bones.rotation[bones.parent[j]]
     turn = wp.transpose(above) @ bones.rotation[j]
@@ -203,7 +203,7 @@ def mean_kernel(points: wp.array[wp.vec3], means: Means) -> None:
 
 @wp.func
 def within(p: wp.vec3, skin: wp.vec3, farthest: float) -> wp.vec3:
-    """p, or what is `farthest` [m] from the skin on the way to it."""
+    """p, pulled back to within `farthest` [m] of the skin."""
     away = wp.length(p - skin)
     if away > farthest:
         return skin + farthest / away * (p - skin)
@@ -212,7 +212,7 @@ def within(p: wp.vec3, skin: wp.vec3, farthest: float) -> wp.vec3:
 
 @wp.func
 def hold(i: int, work: Work, stations: wp.array[wp.vec3], bones: Bones, seams: Seams, rounds: int) -> None:
-    """Brings skin back to its own side of the seams near by, most of all of those that it is far beyond."""
+    """Brings skin back to its own side of the nearby seams, above all of those that it is farthest beyond."""
     v = seams.vertex[i]
     p = work.skin[v]
     is_held = int(0)
@@ -247,13 +247,13 @@ def hold(i: int, work: Work, stations: wp.array[wp.vec3], bones: Bones, seams: S
 
 @wp.func
 def find_share(v: int, work: Work, full: float, step: float) -> None:
-    """How much of a sweep a vertex takes: all of `step` where it was moved by `full` [m] or farther."""
+    """Finds how much of a sweep a vertex takes: all of `step` where it was moved by `full` [m] or farther."""
     work.share[v] = wp.min(wp.length(work.here[v] - work.skin[v]) / full, 1.0) * step
 
 
 @wp.func
 def level(v: int, work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]) -> None:
-    """Levels what was moved."""
+    """Levels a vertex that was moved: it goes towards the mean of its neighbours."""
     total = wp.vec3()
     for k in range(rings.start[v], rings.start[v + 1]):
         total += source[rings.vertex[k]]
@@ -263,7 +263,7 @@ def level(v: int, work: Work, rings: Rings, source: wp.array[wp.vec3], target: w
 
 @wp.func
 def settle(v: int, sweeps: int, work: Work) -> None:
-    """Takes what was levelled by so many sweeps over for all that follows."""
+    """Makes the result of that many sweeps the input of all that follows."""
     p = work.here[v]
     if sweeps % 2 == 1:
         p = work.there[v]

@@ -17,52 +17,52 @@ if TYPE_CHECKING:
     from refu_core.body._model import SmplBody
 
 LEVELS = (0.25, 0.5, 0.75)
-"""A joint has a seam where this share of the skinning weight is the joint's, with all that hangs on it. With the middle
-one alone skin folds beside it: then 84 % of recorded frames don't intersect themselves, in place of 90 %."""
+"""A joint has a seam where this share of the skinning weight belongs to the joint and all that hangs on it. With the
+middle one alone skin folds beside it: then 84 % of recorded frames don't intersect themselves, instead of 90 %."""
 _JOINTS = [joint for joint in range(1, len(PARENTS)) if JOINT_NAMES[joint].split("_")[-1] not in ("hand", "foot")]
 """Fingers and toes fold within a hand or foot, which no garment lies on; a third of all rows would be theirs."""
 SPACING = 0.015
 """Stations along a seam are about this far apart [m]: as far as the vertices of a body."""
 _WIDTH = 0.03
-"""How far along a seam its stations are averaged for a vertex [m]: wider than a mesh's steps, narrower than a limb."""
+"""How far along a seam its stations are averaged for a vertex [m]: wider than a mesh's edges, narrower than a limb."""
 _ASIDE = 0.03
-"""Skin up to this far on both sides of a seam says which way it parts them [m]."""
+"""Skin up to this far from a seam, on both sides, determines the direction in which the seam parts them [m]."""
 _AHEAD = 0.2
-"""Skin lower over a seam than this share of its distance lies along the seam, which doesn't part it from anything:
-held by it, single vertices moved by up to 3 mm where nothing overlaps."""
+"""Skin that is lower over a seam than this share of its distance lies along the seam, which doesn't part it from
+anything. When such skin was held, single vertices moved by up to 3 mm where nothing overlaps."""
 N_STATIONS = 6
-"""Stations that a vertex sees."""
+"""Stations that a vertex is held by."""
 
 
 class Creases(NamedTuple):
     """Half spaces that keep skin on its own side of a joint's seam, R in all, in the order of the vertices.
 
-    A seam is a line on the skin, sampled at S stations. Where the joint bends, a plane through the posed seam, which
-    turns with the joint by the seam's level, keeps skin of both sides apart.
+    A seam is a line on the skin, sampled at S stations. Where the joint bends, a plane through the posed seam keeps the
+    skin of both sides apart; it turns with the joint by the seam's level.
     """
 
     station_start: NDArray[np.int64]
-    """Station s is the mean of the vertices number `station_start[s]` to `station_start[s + 1]` of the next two,
+    """Station s is the weighted mean of rows `station_start[s]` to `station_start[s + 1]` of the next two arrays,
     shape (S + 1,)."""
     station_vertex: NDArray[np.int64]
     station_weight: NDArray[np.float64]
     vertex: NDArray[np.int64]
-    """Shape (R,)."""
+    """The vertex that is held, shape (R,)."""
     rotation: NDArray[np.int64]
-    """The joint times the number of `LEVELS`, plus the seam's level, shape (R,)."""
+    """The joint times the number of `LEVELS`, plus the index of the seam's level, shape (R,)."""
     normal: NDArray[np.float64]
-    """Of the plane in the rest pose, towards the vertex's side, shape (R, 3)."""
+    """Normal of the plane in the rest pose, towards the vertex's side, shape (R, 3)."""
     height: NDArray[np.float64]
     """Distance from the plane in the rest pose [m], positive, shape (R,)."""
     along: NDArray[np.float64]
     """Distance from the seam in the rest pose [m], shape (R,)."""
     stations: NDArray[np.int64]
-    """What the plane goes through is the mean of these, shape (R, 6) …"""
+    """The plane goes through the mean of these stations, shape (R, 6) …"""
     weights: NDArray[np.float64]
-    """… by these weights, shape (R, 6)."""
+    """… with these weights, shape (R, 6)."""
 
 
-@lru_cache(maxsize=3)  # every pipeline and every checker of one body asks for the same
+@lru_cache(maxsize=3)  # every pipeline and every checker of a body asks for the same ones
 def find_creases(body: SmplBody, reach: float) -> Creases:
     """The creases of a body. Skin farther than `reach` [m] from a seam isn't held by it."""
     rest, weights = (one.double().cpu().numpy() for one in (body.v_template, body.weights))
@@ -135,7 +135,7 @@ def _falloff(distance: NDArray[np.float64], width: float) -> NDArray[np.float64]
 def _parting(
     places: NDArray[np.float64], rest: NDArray[np.float64], is_moved: NDArray[np.bool_], tree: cKDTree
 ) -> NDArray[np.float64]:
-    """At places on a seam (S, 3), the unit vectors from the skin near by that isn't moved to that which is."""
+    """Unit vectors at places on a seam (S, 3), from the nearby skin that isn't moved to the skin that is."""
     normals = np.zeros_like(places)
     for i, (place, near) in enumerate(zip(places, tree.query_ball_point(places, _ASIDE), strict=True)):
         weight = np.maximum(_ASIDE - np.linalg.norm(rest[near] - place, axis=1), 1e-9)

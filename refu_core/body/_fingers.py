@@ -1,4 +1,4 @@
-"""Models with fingers and faces (SMPL-H, SMPL-X) as SMPL's 24 joints: what hangs from a wrist is a hand."""
+"""Reduces models with fingers and faces (SMPL-H, SMPL-X) to SMPL's 24 joints: all that hangs from a wrist is a hand."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ N_WITH_FINGERS = (52, 55)
 
 
 def without_fingers(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The arrays of such a model with 24 joints; those of any other as they are.
+    """The arrays of such a model reduced to 24 joints; those of any other model unchanged.
 
-    A hand's joint is the mean of the knuckles at its wrist, and takes along whatever fingers do; jaw and eyes go with
-    the head. Poses of fingers move nothing any more, nor do their blend shapes.
+    A hand's joint is the mean of the knuckles at its wrist, and moves all that the fingers moved; jaw and eyes go with
+    the head. Finger poses no longer move anything, nor do their blend shapes.
     """
     found = dict(arrays)
     tree = np.asarray(arrays["kintree_table"])
@@ -35,7 +35,7 @@ def without_fingers(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any
         or regressor.shape[:1] != (n,)
         or not (parents[_SHARED:] < np.arange(_SHARED, n)).all()
     ):
-        return found  # whoever checks shapes says so
+        return found  # the later check of shapes reports it
     goes_with = np.arange(n)
     for joint in range(_SHARED, n):
         parent = int(parents[joint])

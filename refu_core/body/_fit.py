@@ -1,4 +1,4 @@
-"""A body that isn't built in, and what the built-in ones are to it."""
+"""Fits the built-in mesh to other bodies, and finds how they differ from the built-in ones."""
 
 from __future__ import annotations
 
@@ -27,54 +27,54 @@ if TYPE_CHECKING:
     from refu_core.body._register import Array
 
 REGISTERED = "neutral"
-"""The built-in body that is laid onto others: half way between the two it can become."""
+"""The built-in body that is laid onto others: it is half way between the other two."""
 POOR_FIT = 3e-3
-"""Surfaces that are farther apart than this on average [m] aren't those of two bodies in the T-pose. (Those in
+"""Surfaces farther apart than this on average [m] don't belong to two bodies in the T-pose. (Those in
 tests/smpl_file.py are .3 to .5 mm apart.)"""
 _USUAL = (1.2, 2.3)
-"""Bodies whose garments look as on the built-in ones [m]. At 1.3 m they do; at 0.9 m a collar stands off the neck."""
+"""Heights at which garments look as on the built-in bodies [m]. At 1.3 m they do; at 0.9 m a collar is off the neck."""
 _ANGLE_SPREAD = 0.1
-"""Of a joint between two rest poses [rad]."""
+"""How much a joint's angle differs between two rest poses [rad]."""
 _TRUST = 1e-3
-"""A unit of β that moves skin by no more than this [m] isn't taken for what it fits: it would be noise."""
+"""A beta that moves skin by no more than this per unit [m] is hardly used: it would fit noise."""
 _END_SHARE = 0.1
-"""How much hands, feet and heads count where shapes are compared."""
+"""How much hands, feet and heads count when shapes are compared."""
 _REGRESSED = 400
-"""Vertices that a joint is regressed from."""
+"""Number of vertices that a joint is regressed from."""
 _VERSION = 1
-"""Of what `register` does: what another version has kept isn't used."""
+"""Version of what `register` computes: results that another version has cached aren't used."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeMap:
-    """Betas of one body to those of another: β' = offset + matrix β."""
+    """Maps betas of one body to those of another: β' = offset + matrix β."""
 
     matrix: Tensor
     """Shape (10, 10)."""
     offset: Tensor
     """Shape (10,)."""
     limit: float = 3.0
-    """No component of β' is larger: nothing was trained beyond."""
+    """Largest magnitude of a component of β': nothing was trained beyond it."""
 
     def __call__(self, betas: Tensor) -> Tensor:
-        """Of betas (B, 10), shape (B, 10). Differentiable."""
+        """The mapped betas, shape (B, 10), of betas (B, 10). Differentiable."""
         return (self.offset.to(betas) + betas @ self.matrix.to(betas).T).clamp(-self.limit, self.limit)
 
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """What of a body isn't in the shape space of a built-in one, at the V vertices of the built-in mesh."""
+    """What a built-in body's shape space can't express of another body, at the V vertices of the built-in mesh."""
 
     source: SmplBody
     """The built-in body, float64, on the CPU."""
     betas: ShapeMap
-    """The body's betas to those of the built-in one."""
+    """Maps the body's betas to those of the built-in one."""
     template: Array
-    """Of the mean shape at rest [m], shape (V, 3)."""
+    """Difference of the mean shape at rest [m], shape (V, 3)."""
     directions: Array
-    """Of a unit of each beta [m], shape (V, 3, 10)."""
+    """Difference of the displacement per unit of each beta [m], shape (V, 3, 10)."""
     weights: Array
-    """Of the skinning weights, shape (V, 24)."""
+    """Difference of the skinning weights, shape (V, 24)."""
 
 
 class BodyFit:
@@ -84,17 +84,17 @@ class BodyFit:
         self.body = body
         self.registration = registration
         self.fingerprints = fingerprints or (body.fingerprint,)
-        """Bodies that weights may have been trained on to be this one's own."""
+        """Fingerprints of bodies: weights trained on any of them are this body's own."""
         self._of: dict[str, Difference] = {}
 
     @property
     def is_poor(self) -> bool:
-        """Whether the surfaces are too far apart to trust what was transferred."""
+        """Whether the surfaces are too far apart to trust what is transferred."""
         return self.registration.mean_distance > POOR_FIT
 
     @property
     def text(self) -> str:
-        """The quality, for people."""
+        """The quality of the fit, in words."""
         found = self.registration
         return (
             f"{1e3 * found.mean_distance:.1f} mm on average, {1e3 * found.far_distance:.1f} mm at the 99th percentile"
@@ -102,7 +102,7 @@ class BodyFit:
 
     @property
     def warnings(self) -> list[str]:
-        """What there is to warn of, for people."""
+        """Warnings about the fit, in words."""
         found, tall = [], float(np.ptp(self.body.arrays.v_template[:, 1]))
         if self.is_poor:
             wanted = f"wanted {1e3 * POOR_FIT:g} mm at most"
@@ -113,7 +113,7 @@ class BodyFit:
         return found
 
     def carried(self, values: NDArray[np.floating]) -> Array:
-        """`values` of the body's vertices (N, …) at the vertices of the built-in mesh (V, …)."""
+        """`values` of the body's vertices (N, …), interpolated at the vertices of the built-in mesh (V, …)."""
         place = self.registration.place
         faces = self.body.faces.cpu().numpy()
         there: Array = np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
@@ -124,7 +124,7 @@ class BodyFit:
         return self.carried(self.body.arrays.shapedirs)
 
     def difference(self, name: str) -> Difference:
-        """From the built-in body `name`."""
+        """How the body differs from the built-in body `name`."""
         if name not in self._of:
             self._of[name] = self._differ(load_body(name, dtype=torch.float64))
         return self._of[name]
@@ -146,7 +146,7 @@ class BodyFit:
         return Difference(source, shape_map, left[:, :, 0], left[:, :, 1:], weights)
 
     def resampled(self) -> BodyFit:
-        """The same body as the built-in mesh: its shape space, joints and skin, whatever its own mesh is like."""
+        """The same body on the built-in mesh: its shape space, joints and skin, whatever its own mesh is like."""
         arrays, source = self.body.arrays, load_body(REGISTERED)
         vertices, directions = self.registration.vertices, self.directions()
         weights = self.carried(arrays.weights).clip(0)
@@ -166,14 +166,14 @@ class BodyFit:
 
 
 def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
-    """The body's joints, for every β, from vertices (V, 3) near them that move by `directions` (V, 3, 10)."""
+    """Regresses the body's joints, for every β, from vertices (V, 3) near them that move by `directions` (V, 3, 10)."""
     exact = body.to(device="cpu", dtype=torch.float64)
     joints = exact.joint_template.numpy()
     moved = exact.rest_joints(torch.eye(N_BETAS, dtype=torch.float64)).numpy() - joints  # (10, 24, 3)
     tree, rows = cKDTree(vertices), np.zeros((N_JOINTS, len(vertices)))
     for j, joint in enumerate(joints):
         near = np.asarray(tree.query(joint, _REGRESSED)[1])
-        # Millimetres a unit of β count as much as metres of the place: both must be right.
+        # The displacements (millimetres per unit of β) must be matched as well as the place (metres).
         known = [np.ones((1, len(near))), vertices[near].T, directions[near].reshape(len(near), -1).T]
         goal = [np.ones(1), joint, moved[:, j].T.ravel()]
         uniform = np.full(len(near), 1 / len(near))
@@ -186,11 +186,11 @@ def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
 def load_fit(
     body: str | PathLike[str] | SmplBody, *, betas_from: bool = False, device: str | torch.device = "cpu"
 ) -> BodyFit:
-    """A body and the built-in mesh laid onto it: some seconds for one that hasn't been seen before.
+    """Loads a body and lays the built-in mesh onto it, which takes some seconds for a body not seen before.
 
     Args:
         body: a built-in name, the path of an SMPL-layout file, or a loaded body.
-        betas_from: give the same body as the built-in mesh, whatever the file's own mesh is like (`BodyFit.resampled`).
+        betas_from: give the same body on the built-in mesh, whatever the file's own mesh is like (`BodyFit.resampled`).
         device: where its tensors live.
 
     Raises:
@@ -213,7 +213,7 @@ def _same_mesh(body: SmplBody, source: SmplBody) -> bool:
 
 
 def _corners(faces: NDArray[np.int64], n_vertices: int) -> OnSurface:
-    """Each vertex as a place of the mesh that it is of."""
+    """Each vertex of a mesh as a point of the mesh's own surface."""
     face, corner = np.zeros(n_vertices, np.int64), np.zeros(n_vertices, np.int64)
     for k in range(3):
         face[faces[:, k]], corner[faces[:, k]] = np.arange(len(faces)), k
@@ -221,7 +221,7 @@ def _corners(faces: NDArray[np.int64], n_vertices: int) -> OnSurface:
 
 
 def _registered(source: SmplBody, body: SmplBody) -> Registration:
-    """As `register`, kept from one process to the next."""
+    """As `register`, cached from one process to the next."""
     name = f"fit-{_VERSION}-{source.fingerprint}-{body.fingerprint}"
     known = recall(name, keys=("vertices", "face", "weight", "distances"))
     if known is None or not _makes_sense(known, source, body):
@@ -230,7 +230,7 @@ def _registered(source: SmplBody, body: SmplBody) -> Registration:
         known = {"vertices": made.vertices.astype(np.float32), "face": made.place.face.astype(np.int32)}
         known |= {"weight": made.place.weight.astype(np.float32), "distances": distances}
         keep(name, known)
-    # What was kept is rounded, so what wasn't is, too: both are the same body.
+    # What is cached is rounded, so a new result is rounded, too: both give the same body.
     place = OnSurface(known["face"].astype(np.int64), known["weight"].astype(np.float64))
     mean, far = known["distances"].tolist()
     return Registration(known["vertices"].astype(np.float64), place, mean, far)

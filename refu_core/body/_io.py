@@ -19,7 +19,7 @@ from refu_core.modes import BUILTIN_BODIES
 
 _KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs", "posedirs")
 _MISNAMED = ("faces",)
-"""Asked for to say what they should be called."""
+"""Read only so that an error can say what the key should be called."""
 _MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx")
 _WANTED = "a body model, an .npz or an official .pkl file"
 
@@ -62,7 +62,7 @@ def load_body(
 
 @cache
 def _builtin(name: str) -> BodyArrays:
-    """Read once: a pipeline asks for its garments' body several times."""
+    """The arrays of a built-in body, read once: a pipeline asks for its garments' body several times."""
     with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
         data = read_npz(path, keys=_KEYS, error=BodyError, wanted=_WANTED)
     arrays = BodyArrays.from_mapping(data, source=f"body {name}")

@@ -48,7 +48,7 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
 
 
 class RigidTransforms(NamedTuple):
-    """Maps from the rest pose to the posed body, one a joint."""
+    """Maps from the rest pose to the posed body, one per joint."""
 
     rotation: Tensor
     """Shape (B, 24, 3, 3)."""
@@ -57,7 +57,7 @@ class RigidTransforms(NamedTuple):
 
 
 def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
-    """Posed joints [m], shape (B, 24, 3), and the transforms that take points at rest with each joint's bone.
+    """Posed joints [m], shape (B, 24, 3), and the transforms that move rest-pose points with each joint's bone.
 
     Args:
         rotations: rotation of each joint relative to its parent, shape (B, 24, 3, 3).

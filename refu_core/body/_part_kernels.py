@@ -1,4 +1,4 @@
-"""What parts the segments of a posed body: who touches whom, and the way to the surface between them."""
+"""Parts the segments of a posed body: which vertices touch which segments, and the way to the surface between them."""
 
 import warp as wp
 
@@ -22,12 +22,12 @@ from refu_core.body._pose_kernels import turned
 wp.set_module_options({"enable_backward": False})
 
 DEEPEST = wp.constant(0.1)
-"""Deeper than this no vertex is in another segment [m]: the trunk's half."""
-# More than what rounding takes from a distance [m].
+"""No vertex is deeper in another segment than this [m]: half of the trunk's thickness."""
+# More than rounding can take from a distance [m].
 ROUNDED = wp.constant(1e-5)
-# A ray along no axis of a mesh.
+# A ray that isn't along any axis of a mesh.
 _RAY = wp.constant(wp.vec3(0.5418, 0.6389, 0.5461))
-# A closest point with less than this of a corner lies on the edge across.
+# A closest point that has a smaller weight than this at a corner lies on the opposite edge.
 _WITHIN = wp.constant(1e-4)
 
 
@@ -41,7 +41,7 @@ class Segments:
     faces: wp.array[wp.vec3i]
     first_face: wp.array[int]
     gap: wp.array2d[float]
-    """What vertex v keeps from segment k [m]."""
+    """The distance that vertex v keeps from segment k [m]."""
     ratio: wp.array2d[float]
     """How many times as soft segment k is as segment i."""
     path: wp.array2d[int]
@@ -59,17 +59,17 @@ class Skins:
     of: wp.array[int]
     """The segment of each piece."""
     gap: wp.array2d[float]
-    """The most that any of its vertices keeps from segment k [m]."""
+    """The largest distance that any vertex of a piece keeps from segment k [m]."""
 
 
 @wp.func
 def find_near(i: int, work: Work, segments: Segments, bundles: Bundles, skins: Skins) -> None:
-    """Lists the vertices of piece i that may be nearer to a segment than they may be, by boxes."""
+    """Lists the vertices of piece i that may be too near to a segment, judged by boxes."""
     found = int(0)
     low = bundles.low[skins.bundle[i]]
     high = bundles.high[skins.bundle[i]]
     for k in range(segments.trees.shape[0]):
-        # Where no joint is bent, segments are as far from each other as at rest.
+        # If no joint between them is bent, segments are as far from each other as at rest.
         may = (segments.path[skins.of[i], k] & work.counts[BENT_JOINTS]) != 0 and skins.gap[i, k] > 0.0
         if may and is_near(low, high, k, skins.gap[i, k], bundles):
             found |= 1 << k
@@ -96,8 +96,11 @@ def find_near(i: int, work: Work, segments: Segments, bundles: Bundles, skins: S
 
 @wp.func
 def distance_of(tree: wp.uint64, p: wp.vec3, hit: wp.MeshQueryPoint) -> float:
-    """Signed by the face's normal where the closest point is within a face, else by how many faces a ray meets: at an
-    edge of a cap the sign of a normal is wrong."""
+    """The signed distance [m] of p from the tree that has its closest point at `hit`.
+
+    The sign is that of the face's normal where the closest point is within a face. Elsewhere it depends on how many
+    faces a ray meets: at an edge of a cap the sign of a normal is wrong.
+    """
     away = p - wp.mesh_eval_position(tree, hit.face, hit.u, hit.v)
     distance = wp.length(away)
     if wp.min(wp.min(hit.u, hit.v), 1.0 - hit.u - hit.v) > _WITHIN:
@@ -109,7 +112,7 @@ def distance_of(tree: wp.uint64, p: wp.vec3, hit: wp.MeshQueryPoint) -> float:
 
 @wp.func
 def touch(v: int, work: Work, segments: Segments) -> None:
-    """Which segments a vertex is nearer to than it may be, of those whose surface is that near."""
+    """Finds the segments whose surface is nearer to a vertex than the gap, and which of them it is outside of."""
     p = work.points[v]
     mine = int(0)
     seen = int(0)
@@ -133,7 +136,7 @@ def touch(v: int, work: Work, segments: Segments) -> None:
 
 @wp.func
 def deepen(v: int, rounds: int, work: Work, segments: Segments, rings: Rings) -> None:
-    """A vertex next to one that is inside a segment is inside it, too, unless the surface runs between them."""
+    """Finds which neighbours of a vertex that is inside a segment are inside it, too: the surface may run between."""
     inside = work.touched[v] & ~work.outside[v]
     if inside == 0:
         return
@@ -156,7 +159,7 @@ def deepen(v: int, rounds: int, work: Work, segments: Segments, rings: Rings) ->
 
 @wp.func
 def normal_at(bones: Bones, v: int) -> wp.vec3:
-    """The smoothed normal that the bones give vertex v: a fold doesn't turn it over."""
+    """The smoothed rest normal of vertex v, turned with the bones: a fold doesn't flip it."""
     return wp.normalize(turned(v, bones.start, bones.joint, bones.weight, bones.rotation, bones.normal))
 
 
@@ -172,9 +175,9 @@ def way_out(
     segments: Segments,
     bones: Bones,
 ) -> tuple[wp.vec3, float]:
-    """How p, with its skin's `normal` and `sunk` below that skin [m], gives way to segment k within `farthest` [m].
+    """The step by which p gives way to segment k within `farthest` [m], and the distance of k's surface, at most that.
 
-    Also how far its surface is, `farthest` at most.
+    `normal` is that of p's skin, and `sunk` how far p has already sunk below where it started [m].
     """
     hit = wp.mesh_query_point_no_sign(segments.trees[k], p, farthest)
     if not hit.result:
@@ -197,14 +200,14 @@ def way_out(
 
 @wp.func
 def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rounds: int) -> None:
-    """Moves a vertex to its own side of the surface between its segment and another one, in Newton's steps."""
+    """Moves a vertex to its own side of the surface between its segment and another one, by Newton steps."""
     touched = work.touched[v]
     outside = work.outside[v]
     start = work.points[v]
     p = start
     own = segments.own[v]
     normal = normal_at(bones, v)
-    reach = float(DEEPEST)  # no surface is farther, which makes a query short
+    reach = float(DEEPEST)  # no surface is farther, which keeps queries short
     for _ in range(rounds):
         step = wp.vec3()
         total = float(0.0)
@@ -212,7 +215,7 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
         sunk = wp.dot(start - p, normal)
         for k in range(segments.trees.shape[0]):
             if (touched >> k) & 1 == 1:
-                # The surface is within the gap of where `touch` found it; only `deepen` looks farther inside.
+                # `touch` finds vertices whose start is within the gap of the surface; only `deepen` finds deeper ones.
                 is_at = (outside >> k) & 1 == 1 or work.is_front[v] == 0
                 far = wp.where(is_at, wp.min(segments.gap[v, k] + wp.length(p - start), reach), reach)
                 ratio = segments.ratio[own, k]
@@ -238,7 +241,7 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
     for r in range(rings.start[v], rings.start[v + 1]):
         e = rings.edge[r]
         w = rings.vertex[r]
-        if v < w or work.touched[w] == 0:  # once an edge
+        if v < w or work.touched[w] == 0:  # each edge once
             work.hot[wp.atomic_add(work.counts, HOT, 1)] = e
             for c in range(2):
                 end = rings.ends[e][c]
@@ -257,11 +260,13 @@ def raise_edge(
     bones: Bones,
     steep: float,
 ) -> None:
-    """How the middle of a hot edge gives way, if its ends were moved by more than `steep` [m] apart from each other;
-    in full from twice that on."""
+    """Finds how the midpoint of a hot edge gives way.
+
+    It does so where the ends' moves differ by more than `steep` [m], in full from twice that on.
+    """
     v = rings.ends[e][0]
     w = rings.ends[e][1]
-    # One that neither end of has moved in the last round gives way as before.
+    # If neither end moved in the last round, the edge gives way as before.
     if rounds > 0 and work.is_end[v] <= rounds and work.is_end[w] <= rounds:
         return
     step = wp.vec3()
@@ -278,7 +283,7 @@ def raise_edge(
         middle = 0.5 * (moved[v] + moved[w])
         for k in range(segments.trees.shape[0]):
             if (either >> k) & 1 == 1 and k != segments.own[v] and k != segments.own[w]:
-                # Surfaces are no farther from the middle than from where its ends were when they were asked.
+                # The surface is at most as far as it was from an end, plus the way from there to the midpoint.
                 far = float(DEEPEST)
                 if (work.touched[v] >> k) & 1 == 1:
                     far = wp.min(far, work.reach[v] + wp.length(middle - work.parted[v]))
@@ -296,7 +301,7 @@ def raise_edge(
 
 @wp.func
 def follow(v: int, rounds: int, work: Work, moved: wp.array[wp.vec3], rings: Rings) -> None:
-    """A vertex goes with its edges, most of all with those that have far to go."""
+    """Moves a vertex with its edges, above all with those that have far to go."""
     step = wp.vec3()
     total = float(0.0)
     for r in range(rings.start[v], rings.start[v + 1]):
@@ -319,7 +324,7 @@ def closest_kernel(
     corners: wp.array[wp.vec3],
     sign: wp.array[float],
 ) -> None:
-    """The closest face of segment `which`, the weights of its corners there, and on which side of it each point is."""
+    """Finds each point's closest face of segment `which`, the weights of its corners there, and the point's side."""
     i = wp.tid()
     k = which[i]
     hit = wp.mesh_query_point_no_sign(segments.trees[k], points[i], DEEPEST)
@@ -334,7 +339,7 @@ def closest_kernel(
 def thickness_kernel(
     body: wp.uint64, points: wp.array[wp.vec3], normal: wp.array[wp.vec3], thickness: wp.array[float]
 ) -> None:
-    """How far it is from each vertex to the skin on the other side [m]."""
+    """Finds how far it is from each vertex to the skin on the other side [m]."""
     v = wp.tid()
     thickness[v] = DEEPEST
     hit = wp.mesh_query_ray(body, points[v] - 1.0e-4 * normal[v], -normal[v], DEEPEST)
@@ -344,7 +349,7 @@ def thickness_kernel(
 
 @wp.kernel
 def clearance_kernel(most: float, points: wp.array[wp.vec3], segments: Segments, clearance: wp.array2d[float]) -> None:
-    """The signed distance of each vertex from each segment but its own, at `most` so much [m]."""
+    """Finds the signed distance of each vertex from each segment but its own, limited to `most` [m] either way."""
     v, k = wp.tid()
     p = points[v]
     distance = float(0.0)
@@ -352,7 +357,7 @@ def clearance_kernel(most: float, points: wp.array[wp.vec3], segments: Segments,
         hit = wp.mesh_query_point_no_sign(segments.trees[k], p, most)
         if hit.result:
             distance = distance_of(segments.trees[k], p, hit)
-        else:  # so it is outside, or deep inside
+        else:  # then it is far outside or deep inside
             distance = wp.where(wp.mesh_query_ray_count_intersections(segments.trees[k], p, _RAY) % 2 == 1, -most, most)
     clearance[v, k] = distance
 
@@ -361,7 +366,7 @@ def clearance_kernel(most: float, points: wp.array[wp.vec3], segments: Segments,
 def nearest_kernel(
     tree: wp.uint64, points: wp.array[wp.vec3], face: wp.array[wp.int32], weight: wp.array[wp.vec3]
 ) -> None:
-    """The face closest to each point, and the barycentrics of the closest point at its vertices 0, 1, 2."""
+    """Finds the face closest to each point, and the barycentrics of the closest point at its vertices 0, 1, 2."""
     i = wp.tid()
     hit = wp.mesh_query_point_no_sign(tree, points[i], 1.0e3)
     face[i] = hit.face

@@ -1,4 +1,4 @@
-"""The parts of a body, by SMPL joint: one table, and what others group it to."""
+"""The parts of a body, by SMPL joint: one table, and groups of its entries."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ MIRRORED_JOINTS: Joints = tuple(JOINT_NAMES.index(_other_side(name)) for name in
 
 
 def weight_of_parts(weights: Tensor, parts: Collection[Joints]) -> Tensor:
-    """Which share of each vertex moves with each of P parts, shape (V, P), of skinning weights (V, 24)."""
+    """The share of each vertex that moves with each of P parts, shape (V, P), from skinning weights (V, 24)."""
     groups = weights.new_zeros(weights.shape[1], len(parts))
     for part, joints in enumerate(parts):
         groups[list(joints), part] = 1
@@ -59,5 +59,5 @@ def weight_of_parts(weights: Tensor, parts: Collection[Joints]) -> Tensor:
 
 
 def part_of_faces(weights: Tensor, faces: Tensor, parts: Collection[Joints]) -> Tensor:
-    """The part that each face (F, 3) moves with most, int64, shape (F,), of skinning weights (V, 24)."""
+    """The part that each face (F, 3) moves with most, int64, shape (F,), from skinning weights (V, 24)."""
     return weight_of_parts(weights.double(), parts)[faces].sum(1).argmax(1)

@@ -1,4 +1,4 @@
-"""What poses a body when no derivative is asked for: a few launches in place of two hundred small tensor operations."""
+"""Kernels that pose a body when no derivative is needed: a few launches replace two hundred small tensor operations."""
 
 from typing import TYPE_CHECKING
 
@@ -36,7 +36,7 @@ def chain_kernel(
     translation: wp.array2d[wp.vec3],
     posed: wp.array2d[wp.vec3],
 ) -> None:
-    """Poses the joints of each body, parents first; joints of one shape do for all bodies."""
+    """Poses the joints of each body, parents first; `joints` of a single shape are used for all bodies."""
     b = wp.tid()
     shape = wp.min(b, joints.shape[0] - 1)
     for j in range(parents.shape[0]):
@@ -61,7 +61,7 @@ def turned(
     rotation: wp.array[wp.mat33],
     normal: wp.array[wp.vec3],
 ) -> wp.vec3:
-    """A vertex's normal at rest, turned as skinning turns the vertex (`JointWeights`)."""
+    """The rest normal of vertex v, rotated as skinning rotates the vertex (`JointWeights`)."""
     way = wp.vec3()
     for k in range(start[v], start[v + 1]):
         way += weight[k] * (rotation[joint[k]] @ normal[v])
@@ -86,9 +86,9 @@ def skin_kernel(
     # output
     posed: wp.array2d[wp.vec3],
 ) -> None:
-    """Moves point v by the joints number `start[v]` to `start[v + 1]`; points of one shape do for all bodies.
+    """Moves point v by the joints in rows `start[v]` to `start[v + 1]`.
 
-    A thread moves `each` in number of one body.
+    Points of a single shape are used for all bodies. A thread moves `each` points of one body.
     """
     b, strip = wp.tid()
     shape = wp.min(b, points.shape[0] - 1)
@@ -96,7 +96,7 @@ def skin_kernel(
         t = Transform()
         k = int(start[v])
         last = start[v + 1]
-        while k < last:  # half the instructions of Warp's range
+        while k < last:  # takes half the instructions of Warp's range
             t += weight[k] * transforms[b, joint[k]]
             k += 1
         p = points[shape, v]

@@ -1,7 +1,7 @@
 """Registration: the built-in mesh laid onto the surface of another body in its rest pose.
 
-Three bodies are built in and share one mesh, so one registration tells of all three which place of theirs is which of
-the other body.
+The three built-in bodies share one mesh, so one registration tells for all three which of their points is which point
+of the other body.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationSettings:
-    """How a mesh is laid onto a surface; figures are of the bodies in tests/smpl_file.py."""
+    """How a mesh is laid onto a surface; figures are for the bodies in tests/smpl_file.py."""
 
     rounds: int = 10
-    """Newton's steps to shape and pose, each with the points that are closest then."""
+    """Newton steps for shape and pose, each with the points that are closest at that moment."""
     normal_scale: float = 0.05
-    """Of two normals that stand at right angles, as far as being 1.4 times so far apart counts [m]: flanks don't find
-    the arm beside them."""
+    """Normals at right angles count as much as points 1.4 times this far apart [m]: flanks aren't matched with the arm
+    beside them."""
     reach: float = 0.04
-    """What is farther from the surface than this counts less and less [m]."""
+    """Points farther from the surface than this count less and less [m]."""
     joint_spread: float = 0.04
-    """How far joints of two models are apart in one body [m]. Hips (by 10 cm), spine and collars aren't looked at."""
+    """How far apart two models put the same joint of a body [m]. Hips (10 cm apart), spine and collars aren't used."""
     angle_spread: float = 0.1
-    """How far a joint is turned from one rest pose to the other [rad]."""
+    """How far a joint turns from one rest pose to the other [rad]."""
     noise: float = 0.005
-    """Of the surface against joints, angles and betas [m]."""
+    """Noise of the surface, which weighs it against joints, angles and betas [m]."""
     stiffness: tuple[float, ...] = (300.0, 30.0, 10.0, 3.0, 1.0, 0.3)
-    """How much more it counts that neighbours move alike than that vertices are on the surface, from round to round."""
+    """Weight of neighbours moving alike, relative to that of vertices lying on the surface, for each round."""
     stiff_ends: float = 30.0
-    """How many times stiffer hands, feet and heads are: nothing is worn there, and fingers find the wrong finger."""
+    """How many times stiffer hands, feet and heads are: nothing is worn there, and fingers may match the wrong ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +56,13 @@ class Registration:
     """The built-in mesh (V vertices) on another body."""
 
     vertices: Array
-    """On its rest surface, or near it [m], shape (V, 3)."""
+    """The mesh's vertices on that body's rest surface, or near it [m], shape (V, 3)."""
     place: OnSurface
-    """Which points of its surface these are."""
+    """The points of the surface closest to these vertices."""
     mean_distance: float
-    """Of the two surfaces, hands, feet and head left out [m]."""
+    """Mean distance between the two surfaces, without hands, feet and head [m]."""
     far_distance: float
-    """The 99th percentile [m]."""
+    """The 99th percentile of that distance [m]."""
 
 
 _LOOKED_AT = tuple(
@@ -74,9 +74,9 @@ ENDS = (*joints_of("head"), 7, 8, 10, 11, 20, 21, 22, 23)
 
 
 _ALONG = 0.05
-"""How much a gap along the surface counts of one across it: closest points slide."""
+"""How much a gap along the surface counts, relative to one across it: closest points slide along the surface."""
 _SEEN = 0.01
-"""As if every hundredth vertex were looked at: neighbours are wrong by as much as each other."""
+"""Weight of a vertex, as if only one in a hundred were used: neighbours have similar errors."""
 
 
 class Derivatives(NamedTuple):
@@ -90,7 +90,7 @@ class Derivatives(NamedTuple):
 
 @cache
 def derivatives(name: str) -> Derivatives:
-    """Of a built-in body."""
+    """The derivatives of a built-in body."""
     source, step = load_body(name, dtype=torch.float64), 1e-4
     rest = source(torch.zeros(1, N_JOINTS, 3, dtype=torch.float64))
     turns = [source(pose[None]) for pose in step * torch.eye(3 * N_JOINTS, dtype=torch.float64)]
@@ -108,8 +108,8 @@ def derivatives(name: str) -> Derivatives:
 def register(source: SmplBody, target: SmplBody) -> Registration:
     """Lays the mesh of `source` onto the rest surface of `target`, in some seconds.
 
-    First by shape, pose and place of the source; then each vertex to the closest point, less and less held back by its
-    neighbours.
+    First the source's shape, pose and place are fitted; then each vertex moves to the closest point, held back less
+    and less by its neighbours.
     """
     return _Registrar(source, target).run()
 
@@ -125,7 +125,7 @@ class _Registrar:
         self.is_end = self.source.weights[:, list(ENDS)].sum(1).numpy() > 0.5
 
     def run(self) -> Registration:
-        """All of it."""
+        """Both steps, and how far apart the surfaces are afterwards."""
         vertices = self._draped(self._articulated())
         place = self.surface.closest(vertices)
         there = np.linalg.norm(self.surface.at(place) - vertices, axis=1)[~self.is_end]
@@ -178,7 +178,7 @@ class _Registrar:
         return at
 
     def _at(self, state: Array) -> tuple[Array, Array]:
-        """Vertices (V, 3) and joints (24, 3) [m] of betas, pose [rad] and place [m], side by side, (85,)."""
+        """Vertices (V, 3) and joints (24, 3) [m] of a state (85,): betas, pose [rad] and place [m], side by side."""
         with torch.no_grad():
             numbers = torch.as_tensor(state)
             posed = self.source(numbers[None, N_BETAS:-3], numbers[None, :N_BETAS])

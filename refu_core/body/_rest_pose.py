@@ -1,4 +1,4 @@
-"""Whether a body model stands as all of this project expects it: in metres, upright, facing forward, in the T-pose."""
+"""Checks that a body model stands as this project expects: in metres, upright, facing forward, in the T-pose."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ if TYPE_CHECKING:
     from refu_core.body._model import BodyArrays, SmplBody
 
 _TALL = (0.3, 2.2)
-"""From the ankles to the neck [m]: children and giants."""
+"""Least and greatest distance from ankles to neck [m]: children and giants."""
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281, "decimetres": 10.0}
 _ALONG = 0.8
-"""Cosine of the angle to an axis from which on a body stands, or faces, along it."""
+"""A body stands, or faces, along an axis where the cosine of its angle to it is at least this."""
 _ARMS = 0.5
-"""The same of arms that are stretched out to the sides."""
+"""The same for arms that are stretched out to the sides."""
 _LIMBS = ((1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21))
-"""Hips, knees, shoulders and elbows, and the joints where their limbs end."""
+"""Hips, knees, shoulders and elbows, each with the joint where its limb ends."""
 _AT_LIMB = 0.08
-"""How far from a limb's middle the skin is, on average, that it moves [of the body's height]. Of the built-in bodies
-0.02 at most; skin of the next limb is 0.17 away."""
+"""How far the mean of the skin that a limb moves may be from the limb's middle [of the body's height]. In the built-in
+bodies it is 0.02 at most; the skin of the next limb is 0.17 away."""
 _FARTHEST = 1 / 3
-"""How far a unit of shape, or of a pose's features, moves a vertex at most [of the body's height]: none does it by a
-tenth."""
+"""How far a unit of shape, or of a pose feature, may move a vertex [of the body's height]: in no model is it as much as
+a tenth."""
 _OFF, _LONG = 1 / 3, 1 / 8
-"""How far skin is from the nearest joint at most, and how long an edge is [from the ankles to the neck]. Of the
-built-in bodies 0.17 and 0.03; what is farther off is a vertex that flew away."""
+"""How far skin may be from the nearest joint, and how long an edge may be [of the distance from ankles to neck]. In the
+built-in bodies they are 0.17 and 0.03; beyond these limits a vertex is out of place."""
 _AXES = ("x", "y", "z")
 _WANTED = "wanted metres, y up, facing +z, the subject's left at +x, in the T-pose"
 
 
 def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
-    """Nothing, where the mean shape stands as expected and is a closed surface whose faces are turned outward.
+    """Checks that the mean shape stands as expected, with its faces turned outward, and is closed if `closed`.
 
     Raises:
         BodyError: it has other units or axes, is mirrored, not in the T-pose, open or turned inside out, or its joints
@@ -70,7 +70,7 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
 
 
 def _loose(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
-    """Whether a vertex is where no skin can be; empty if none is."""
+    """What is wrong if a vertex is where no skin can be; empty if none is."""
     v = arrays.v_template
     tall = float(np.linalg.norm(_upward(joints)))
     off = np.asarray(cKDTree(joints).query(v)[0])
@@ -85,14 +85,14 @@ def _loose(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
 
 
 def _upward(joints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From between the ankles to the neck [m], shape (3,)."""
+    """The way from the middle of the ankles to the neck [m], shape (3,)."""
     ankles = joints[[JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]]
     found: NDArray[np.float64] = joints[JOINT_NAMES.index("neck")] - ankles.mean(0)
     return found
 
 
 def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
-    """Whether a limb's joint moves skin that isn't at the limb; empty if none does."""
+    """What is wrong if a limb's joint moves skin that isn't at the limb; empty if none does."""
     tall = float(np.ptp(arrays.v_template[:, 1]))
     for joint, end in _LIMBS:
         follows = arrays.weights[:, joint] > 0.5
@@ -105,7 +105,7 @@ def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
 
 
 def _lacking(arrays: BodyArrays) -> str:
-    """Whether vertices lack faces, segments lack faces, or directions are in no metres; empty if not."""
+    """What is wrong if vertices or segments lack faces, or directions aren't in metres; empty if nothing is."""
     tall = float(np.ptp(arrays.v_template[:, 1]))
     if n_unused := len(arrays.v_template) - len(np.unique(arrays.faces)):
         return f"{n_unused} of {len(arrays.v_template)} vertices belong to no face: leave them out"
@@ -150,7 +150,7 @@ def _fault(vertices: NDArray[np.float64], joints: NDArray[np.float64]) -> str:
 
 
 def _axis(way: NDArray[np.float64]) -> str:
-    """`+y` and the like; `askew` for what is along no axis."""
+    """The axis that a direction is along, such as `+y`; `askew` if it is along none."""
     unit = way / max(float(np.linalg.norm(way)), 1e-12)
     k = int(np.abs(unit).argmax())
     return f"{'+' if unit[k] > 0 else '-'}{_AXES[k]}" if abs(unit[k]) >= _ALONG else "askew"

@@ -27,28 +27,28 @@ SOFTNESS: tuple[tuple[tuple[int, ...], float], ...] = (
     ((7, 10), 0.25),
     ((8, 11), 0.25),
 )
-"""Joints of the segments that give way to each other, and how softly: of two, each gives way by its share of both.
-A trunk is two, as one that is bent to the side comes down upon its own hip.
+"""Joints of the segments that give way to each other, and their softness: of two, each gives way by its share of the
+sum. The trunk is two segments, because a trunk that bends to the side comes down on its own hip.
 Flanks and thighs are flesh; forearms and shins have bone below the skin; hands, feet and heads hardly give way."""
 
 
 class Solids(NamedTuple):
     """K segments of a body, each closed by a fan to the middle of every loop that it was cut along.
 
-    Vertices beyond the body's V are those middles, M in all.
+    Those middles, M in all, are numbered after the body's V vertices.
     """
 
     of_vertex: NDArray[np.int32]
     """The segment of each vertex, shape (V,)."""
     faces: list[NDArray[np.int32]]
-    """Of each segment, into V + M vertices, shape (F_k, 3)."""
+    """Faces of each segment, indexing V + M vertices, shape (F_k, 3)."""
     middle_start: NDArray[np.int32]
-    """Where in the next the vertices begin that each middle is the mean of, shape (M + 1,)."""
+    """Where the vertices that each middle is the mean of begin in `middle_vertex`, shape (M + 1,)."""
     middle_vertex: NDArray[np.int32]
 
 
 def shares(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The share that each vertex has in each segment, (V, K), by skinning weights (V, 24)."""
+    """The share that each vertex has in each segment, (V, K), from skinning weights (V, 24)."""
     return np.stack([weights[:, list(joints)].sum(axis=1) for joints, _ in SOFTNESS], axis=1)
 
 

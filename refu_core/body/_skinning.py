@@ -23,7 +23,7 @@ _skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transfor
 def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTransforms:
     """The joints' transforms, leading shape (B, 24), blended by skinning weights (V, 24), whose rows sum to one.
 
-    Leading shape (B, V); the "rotation" of a blend isn't orthonormal.
+    The result's leading shape is (B, V); the "rotation" of a blend isn't orthonormal.
     """
     blended = weights @ _stacked(transforms)
     return RigidTransforms(blended[..., :9].view(*blended.shape[:2], 3, 3), blended[..., 9:])
@@ -35,7 +35,7 @@ def _stacked(transforms: RigidTransforms) -> Tensor:
 
 
 class JointWeights(NamedTuple):
-    """The joints that have a weight at each of V vertices: of vertex v, rows `start[v]` to `start[v + 1]`."""
+    """The joints that have a weight at each of V vertices: those of vertex v are rows `start[v]` to `start[v + 1]`."""
 
     start: Tensor
     """int32, shape (V + 1,)."""
@@ -46,7 +46,7 @@ class JointWeights(NamedTuple):
 
     @classmethod
     def of(cls, weights: Tensor) -> JointWeights:
-        """Of skinning weights (V, 24)."""
+        """From skinning weights (V, 24)."""
         has_weight = weights != 0
         vertex, joint = torch.nonzero(has_weight, as_tuple=True)
         start = torch.nn.functional.pad(has_weight.sum(1).cumsum(0), (1, 0))
@@ -54,7 +54,7 @@ class JointWeights(NamedTuple):
 
 
 class Skinning:
-    """Linear blend skinning of one mesh, by those joints only that have a weight at a vertex."""
+    """Linear blend skinning of one mesh, using only the joints that have a weight at each vertex."""
 
     def __init__(self, weights: Tensor) -> None:
         """For skinning weights whose rows sum to one, shape (V, 24)."""
@@ -83,7 +83,7 @@ class Skinning:
 def apply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
     """Posed points [m], shape (B, V, 3), of rest-pose points of the same shape, by transforms of the shape (B, V)."""
     posed = transforms.translation
-    # Three sums of columns: a product of thousands of 3 × 3 matrices takes half as long again.
+    # Three sums over columns: multiplying thousands of 3 × 3 matrices takes half as long again.
     for column, coordinate in zip(transforms.rotation.unbind(-1), points.unsqueeze(-1).unbind(-2), strict=True):
         posed = torch.addcmul(posed, column, coordinate)
     return posed
@@ -92,8 +92,8 @@ def apply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
 def unapply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
     """Rest-pose points [m] of posed points [m], both (B, V, 3): the inverse of `apply_transforms`.
 
-    Exact to rounding; where a blend has collapsed (joint rotations of almost half a turn against each other) the
-    determinant is bounded away from zero, so that the result stays finite.
+    Exact up to rounding. Where a blend has collapsed (joint rotations almost half a turn apart) the determinant is
+    bounded away from zero, so that the result stays finite.
     """
     moved = points - transforms.translation
     a, b, c = transforms.rotation.unbind(-1)  # columns

@@ -1,7 +1,7 @@
-"""What pulls a posed body apart, in four kernels of a few steps each.
+"""Pulls a posed body apart, in four kernels of a few steps each.
 
-On a CPU, where a launch costs what hundreds of vertices do, one thread takes all steps (`only` is -1). A GPU takes one
-step a launch, that of the number `only`, and each of its `stride` threads every so many-th item.
+On a CPU, where a launch costs as much as hundreds of vertices, one thread takes all steps (`only` is -1). On a GPU each
+launch takes one step, number `only`, and each of its `stride` threads takes every `stride`-th item.
 """
 
 import warp as wp
@@ -56,9 +56,9 @@ def smooth(
     full: float,
     share: float,
 ) -> None:
-    """Sweeps over what was moved, in 1 + `sweeps` steps; they end in `here` or, if they are odd, in `there`.
+    """Sweeps over what was moved, in 1 + `sweeps` steps; the result is in `here` or, if `sweeps` is odd, in `there`.
 
-    So many steps of the kernel's come `before`.
+    `before` is the number of the kernel's steps that come first.
     """
     if is_due(before, only):
         for i in range(first, work.counts[MOVED], stride):
@@ -86,7 +86,7 @@ def unfold_kernel(
     full: float,
     share: float,
 ) -> None:
-    """Skin is brought to its own side of the seams near by, in 4 + `sweeps` steps."""
+    """Brings skin to its own side of the nearby seams, in 4 + `sweeps` steps."""
     first = wp.tid()
     if is_due(0, only):
         for i in range(first, stations.mean.shape[0], stride):
@@ -104,7 +104,7 @@ def unfold_kernel(
 def look_kernel(
     only: int, stride: int, work: Work, caps: Means, segments: Segments, bundles: Bundles, skins: Skins
 ) -> None:
-    """Which vertices may be near which segments, in 4 steps."""
+    """Finds which vertices may be near which segments, in 4 steps."""
     first = wp.tid()
     if is_due(0, only):
         for i in range(first, caps.mean.shape[0], stride):
@@ -122,7 +122,7 @@ def look_kernel(
 
 @wp.kernel
 def touch_kernel(only: int, stride: int, work: Work, segments: Segments, rings: Rings, rounds: int) -> None:
-    """Which segments they have to give way to, in 1 + `rounds` steps."""
+    """Finds which segments the `near` vertices have to give way to, in 1 + `rounds` steps."""
     first = wp.tid()
     if is_due(0, only):
         for i in range(first, work.counts[NEAR], stride):
@@ -149,7 +149,7 @@ def part_kernel(
     edge_rounds: int,
     steep: float,
 ) -> None:
-    """They give way; what was moved is levelled, and edges are raised: in 2 + `sweeps` + 2 `edge_rounds` steps."""
+    """Makes vertices give way, levels all that moved and raises edges, in 2 + `sweeps` + 2 `edge_rounds` steps."""
     first = wp.tid()
     if is_due(0, only):
         for i in range(first, work.counts[TOUCHING], stride):

@@ -1,4 +1,4 @@
-"""Closest points on a body's surface in its rest pose."""
+"""Closest points on the surface of a mesh, such as a body's."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class OnSurface(NamedTuple):
 
 
 class Surface:
-    """A triangle mesh that is asked for the points closest to others; on the CPU."""
+    """A triangle mesh that finds its points closest to others, on the CPU."""
 
     def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
-        """Of vertices (V, 3) [m] and faces (F, 3)."""
+        """From vertices (V, 3) [m] and faces (F, 3)."""
         self.vertices, self.faces = vertices, faces
         self.normals = vertex_normals(vertices, faces)
         """Unit normals at the vertices, shape (V, 3)."""
@@ -34,7 +34,7 @@ class Surface:
         self._tree = wp.Mesh(points, ints(faces.ravel(), "cpu"))
 
     def closest(self, points: NDArray[np.float64]) -> OnSurface:
-        """What points (N, 3) [m] are closest to."""
+        """The points of the surface that are closest to points (N, 3) [m]."""
         n = len(points)
         face, weight = wp.zeros(n, dtype=wp.int32, device="cpu"), wp.zeros(n, dtype=wp.vec3, device="cpu")
         asked = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
@@ -42,7 +42,7 @@ class Surface:
         return OnSurface(face.numpy().astype(np.int64), weight.numpy().astype(np.float64))
 
     def at(self, found: OnSurface, values: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """What `values` of the vertices (V, …), their places [m] if not given, are at points of the surface (N, …)."""
+        """`values` of the vertices (V, …), by default their places [m], interpolated at surface points (N, …)."""
         values = self.vertices if values is None else values
         there: Any = np.einsum("nk,nk...->n...", found.weight, values[self.faces[found.face]])
         return np.asarray(there)

@@ -21,23 +21,23 @@ class Blend:
     """Spreads the pushes of some vertices over the garment's mesh, so that folds stay.
 
     A few sweeps average towards the smoothest displacements d with nᵢᵀdᵢ ≥ pᵢ, the smoothness term of DRAPE (Guan et
-    al. 2012). They begin with the predicted scale, which may lead beyond the margin, but the bound pᵢ is no more than
-    the way to the margin: α differs from neighbour to neighbour, and would print noise into the cloth.
+    al. 2012). They begin with pushes of the predicted scale, which may lead beyond the margin. The bound pᵢ is no more
+    than the way to the margin: α differs from neighbour to neighbour, and as a bound would print noise into the cloth.
     """
 
     neighbours: Tensor
     """The neighbours of each vertex along edges, one vertex after another, int64, shape (2 E,)."""
     start: Tensor
-    """Where in `neighbours` each vertex's begin, int64, shape (N,)."""
+    """Where in `neighbours` those of each vertex begin, int64, shape (N,)."""
     share: Tensor
-    """One divided by their number, shape (N, 1)."""
+    """One divided by the number of neighbours, shape (N, 1)."""
 
     @classmethod
     def of_faces(cls, faces: Tensor, n_vertices: int) -> Blend:
         """For garments of these `faces`, shape (G, 3), and `n_vertices` N.
 
         Raises:
-            MeshError: A face that names a vertex there isn't.
+            MeshError: A face that names a vertex that doesn't exist.
         """
         ring = Connectivity.of(faces.cpu(), n_vertices).ring
         number = np.diff(ring.start)[:, None]
@@ -76,14 +76,14 @@ class Blend:
         steps: Sequence[float] = _STEPS,
         reach: int = DEFAULT_CONTACT.near,
     ) -> Tensor:
-        """Smooth displacements [m], shape (N, B, 3), along each push at least as long as wanted. Differentiable.
+        """Smooth displacements [m], shape (N, B, 3), that go at least as far along each push as wanted. Differentiable.
 
         Args:
-            push: Where to begin [m]; zero is no push.
-            least: How far each vertex has to go along its push, if that goes so far [m], shape (N, B); by default as
-                far as it goes.
+            push: The displacements to begin with [m]; zero is no push.
+            least: How far each vertex has to go along its push, but no farther than the push itself [m], shape (N, B);
+                by default as far as the push.
             steps: How far each sweep goes towards the mean of the neighbours; 1 is all the way.
-            reach: How many edges from a pushed vertex others give way.
+            reach: Up to how many edges from a pushed vertex others give way.
         """
         is_pushed = (push.detach() != 0).any(dim=-1)
         gives_way = is_pushed.to(push)

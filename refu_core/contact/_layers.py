@@ -1,4 +1,4 @@
-"""Garments worn together: the outer one leaves the inner one as it leaves the body, along the normal of its sheet."""
+"""Garments worn together: the outer one is pushed off the inner one as off the body, along the inner sheet's normal."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ class Layer:
     the height f of a vertex over the sheet is less than the gap ε, x' = x - (f - ε) n, and neighbours give way. Unlike
     a body, a sheet has no inside: only cloth that faces the way the sheet does belongs above it.
 
-    The closest point is searched downhill, from the nearest of a few places around what was closest at rest, in half
-    the time of a tree. What isn't near the sheet at rest (a sleeve beside shorts) is a stranger, and asks the tree.
+    The search for the closest point goes downhill from the nearest of a few vertices around the one closest at rest, in
+    half the time of a tree. A vertex that isn't near the sheet at rest (of a sleeve beside shorts) is a stranger, and
+    asks the tree.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Layer:
         self._below = Sheet(Connectivity.of(below_faces.cpu(), len(below)), below)
         mesh = Connectivity.of(above_faces.cpu(), len(above))
         self.parting = Parting(mesh, above, self._below, settings=settings)
-        """What is done where triangles of this garment and the inner one of the last call cut each other after all."""
+        """Parts this garment from the inner one of the last call where their triangles still cut each other."""
         n = len(above)
         self._given, self._points, self._push, *self._fields = memory(5, n, 3, device=self.device)
         self._count = memory(1, dtype=torch.int32, device=self.device)
@@ -70,7 +71,7 @@ class Layer:
         """The outer garment, (V, 3) [m], off the inner one, (U, 3), and how many of its vertices were below the gap.
 
         The number is an int32 of shape (1,), on the garments' device: a GPU isn't waited for. A call that `goes_on` is
-        for the same inner garment as the last one, and looks at nobody who is where it was left. Not differentiable.
+        for the same inner garment as the last one, and skips vertices that are where it left them. Not differentiable.
         """
         with torch_stream(self.device):
             if not goes_on:
@@ -93,7 +94,7 @@ class Layer:
         return self._points.clone(), n_low
 
     def _recorded(self, data: Any, rules: Any) -> dict[str, Any]:
-        """The launches of a frame: each of them is shorter than what Python makes of its arguments."""
+        """The launches of a frame, recorded: each takes less time than preparing its arguments in Python."""
         n, sheet = len(self._points), self._below.data
         n_strips, each = (1, n) if self._is_serial else (n, 1)
         launches: dict[str, tuple[Any, int, list[Any]]] = {
@@ -109,7 +110,7 @@ class Layer:
 
 
 def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
-    """For a sheet whose edges have these ends at rest [m], (E, 2, 3)."""
+    """The rules for a sheet whose edges have these ends at rest [m], (E, 2, 3)."""
     rules = kernels.LayerRules()
     rules.gap, rules.reach, rules.alike = settings.gap, settings.layer_reach, settings.alike
     rules.longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
@@ -119,9 +120,9 @@ def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
 def _starts(
     above: NDArray[np.float32], below: NDArray[np.float32], mesh: Connectivity, settings: ContactSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Vertices of the sheet below, (U, 3) [m], that each vertex above, (V, 3), looks from: starts (V + 1,) and them.
+    """Where each vertex above, (V, 3) [m], may start to search the sheet below, (U, 3): offsets (V + 1,), and vertices.
 
-    None where it isn't near the sheet at rest. From a vertex without a face there is nowhere to go.
+    A vertex that isn't near the sheet at rest has none. Vertices of the sheet without a face lead nowhere.
     """
     has_face = np.unique(mesh.faces)
     tree, is_free, places = cKDTree(below[has_face]), np.ones(len(has_face), np.bool_), []

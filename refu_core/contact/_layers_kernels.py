@@ -6,9 +6,9 @@ from refu_core.sdf._closest_kernels import closest_on_face, mean_normal
 
 wp.set_module_options({"enable_backward": False})
 
-# Nothing is so far from where it was at rest; it is a limit to what a sheet crumpled into itself may take.
+# Steps of a search. No vertex moves so far from its place at rest; this bounds the search on a crumpled sheet.
 MOST_STEPS = wp.constant(64)
-# In place of the vertex that one comes to: it isn't near the sheet at rest, as a sleeve isn't near shorts.
+# Stands for the vertex found, where a vertex isn't near the sheet at rest, as a sleeve isn't near shorts.
 STRANGER = wp.constant(-2)
 
 
@@ -57,16 +57,16 @@ class Above:
     looks: wp.array[wp.int32]
     """Whether a vertex has to be looked at in this call."""
     found: wp.array[wp.int32]
-    """The vertex of the sheet that each has come to, or `STRANGER`."""
+    """The vertex of the sheet at which each one's search ended, or `STRANGER`."""
     moved: wp.array[wp.int32]
     """Whether the last call has moved it."""
     push: wp.array[wp.vec3]
-    """What brings it to the gap above the sheet [m]."""
+    """The displacement that brings it to the gap above the sheet [m]."""
     field: wp.array[wp.vec3]
     smoother: wp.array[wp.vec3]
     reached: wp.array[wp.int32]
     is_reached: wp.array[wp.int32]
-    """Of a CPU: zero between launches, but for `reached`."""
+    """Memory for the sweeps; on a CPU all but `reached` is zero between launches."""
     count: wp.array[wp.int32]
     """How many have a push."""
 
@@ -89,7 +89,7 @@ def normal_at(v: int, points: wp.array[wp.vec3], cut: Cut) -> wp.vec3:
 
 @wp.func
 def gather(n: int, rounds: int, cut: Cut, rows: wp.array[int], is_listed: wp.array[int]) -> int:
-    """Lists after the first n `rows` who is up to so many edges away, and gives how many they are all together."""
+    """Lists after the first n `rows` the vertices up to `rounds` edges away, and returns how many there are in all."""
     first = int(0)
     last = int(n)
     found = int(n)
@@ -108,7 +108,7 @@ def gather(n: int, rounds: int, cut: Cut, rows: wp.array[int], is_listed: wp.arr
 
 @wp.func
 def heaviest(w: wp.vec3) -> int:
-    """The corner of a face that weighs most."""
+    """The corner of a face with the largest barycentric weight."""
     return wp.where(w[0] >= w[1] and w[0] >= w[2], 0, wp.where(w[1] >= w[2], 1, 2))
 
 
@@ -148,7 +148,7 @@ def nearest_face(p: wp.vec3, start: int, below: Below) -> int:
                 squared = other
                 face = f
                 w = f_w
-        # The closest vertex isn't always a corner of the closest face: on, at the corner that weighs most.
+        # The closest vertex isn't always a corner of the closest face: go on at the corner of largest weight.
         corner = heaviest(w)
         if face == last or below.cut.faces[face, corner] == v:
             break
@@ -173,10 +173,10 @@ def normals_kernel(points: wp.array[wp.vec3], cut: Cut, normals: wp.array[wp.vec
 
 @wp.kernel
 def search_kernel(each: int, goes_on: bool, below: Below, above: Above) -> None:
-    """Takes over what is given, and finds the vertex of the sheet that each vertex comes to, downhill.
+    """Takes over the given vertices, and searches the sheet downhill for the vertex nearest to each.
 
-    From the nearest of those to look from. A call that goes on looks only at what isn't where it was left, or was moved
-    there, from what it found. `each` vertices a thread (`strips`).
+    The search starts at the nearest of the vertex's starts. A call that goes on starts at what the last call found, and
+    skips vertices that the last call didn't move and that are where it left them. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for i in range(first, first + each):
@@ -204,7 +204,7 @@ def search_kernel(each: int, goes_on: bool, below: Below, above: Above) -> None:
 
 @wp.func
 def normal_on(face: int, w: wp.vec3, below: Below) -> wp.vec3:
-    """Unit normal of the sheet at a place on a face, between those of its vertices."""
+    """Unit normal of the sheet at a place on a face, interpolated between those of its vertices."""
     a = below.cut.faces[face, 0]
     b = below.cut.faces[face, 1]
     c = below.cut.faces[face, 2]
@@ -223,7 +223,7 @@ def closest_of_all(p: wp.vec3, reach: float, below: Below) -> int:
 
 @wp.func
 def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rules: LayerRules) -> None:
-    """What brings vertex i to the gap above the face of the sheet that is closest to it, if any is."""
+    """Stores the displacement that brings vertex i to the gap above its closest face of the sheet, if there is one."""
     if face < 0:
         return
     w, feature, offset = closest_on_face(above.points[i], face, below.points, below.cut.faces)
@@ -233,10 +233,10 @@ def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rule
     if height >= rules.gap or far > rules.reach:
         return
     agreement = wp.dot(normal_at(i, above.points, above.cut), normal)
-    # A stranger's outside may face the sheet's: a sleeve that hangs beside shorts.
+    # A stranger may also face the sheet from outside, like a sleeve that hangs beside shorts.
     agreement = wp.where(faces_it, wp.abs(agreement), agreement)
     share = wp.clamp(agreement / rules.alike, 0.0, 1.0)
-    # Whatever ends does so gradually, or cloth would jump from frame to frame.
+    # Every influence fades out gradually; otherwise cloth would jump from frame to frame.
     share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
     if (below.cut.rim[face] >> feature) & 1 != 0:
         share *= wp.max(0.0, 1.0 - wp.length(offset - height * normal) / rules.reach)
@@ -248,10 +248,10 @@ def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rule
 
 @wp.kernel
 def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> None:
-    """What brings each vertex that is looked at to the gap above the sheet, and how many they are that lack something.
+    """Stores what brings each vertex that is looked at to the gap above the sheet, and counts those below the gap.
 
-    A fold that one vertex's search ended in is seldom in the way of its neighbours': what these found is looked at,
-    too. Strangers, and whoever is far below the sheet, ask a tree. `each` vertices a thread (`strips`).
+    Where one vertex's search ended in a fold, its neighbours' seldom did, so what these found is tried, too. Strangers,
+    and vertices far below the sheet, ask a tree. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for i in range(first, first + each):
@@ -265,7 +265,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
                 lift_off(i, closest_of_all(p, rules.reach, below), True, below, above, rules)
             continue
         squared = wp.length_sq(below.points[v] - p)
-        # As near as that, it is the right fold.
+        # A vertex this near is in the right fold.
         if 4.0 * squared > rules.longest * rules.longest:
             for r in range(above.cut.ring_start[i], above.cut.ring_start[i + 1]):
                 beside = above.found[above.cut.ring[r]]
@@ -276,7 +276,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
                         v = beside
             if v != above.found[i]:
                 v = nearest_vertex(p, v, below)
-        # No point of a face is farther from its closest corner than from the middle of three edges of its longest one.
+        # No point of a face is farther from its closest corner than the middle of an equilateral one: 0.578 of an edge.
         if wp.length(below.points[v] - p) <= rules.reach + 0.578 * rules.longest:
             face = nearest_face(p, v, below)
             w, _feature, offset = closest_on_face(p, face, below.points, below.cut.faces)
@@ -304,7 +304,7 @@ def spread(i: int, above: Above, field: wp.array[wp.vec3], smoother: wp.array[wp
 
 @wp.kernel
 def spread_kernel(above: Above, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]) -> None:
-    """`spread` of one vertex a thread."""
+    """`spread`, one vertex a thread."""
     spread(wp.tid(), above, field, smoother)
 
 
@@ -318,7 +318,7 @@ def move_kernel(above: Above) -> None:
 
 @wp.kernel
 def move_all_kernel(above: Above, rounds: int) -> None:
-    """All rounds, and the move, by one thread: of the pushed, and of those that so many rounds reach from there."""
+    """All rounds, and the move, by one thread: for pushed vertices, and for those that the rounds reach from them."""
     n = int(0)
     for i in range(above.push.shape[0]):
         if wp.length_sq(above.push[i]) > 0.0:

@@ -19,9 +19,9 @@ from refu_core.sdf._crossing_kernels import BLOCK
 class Parting:
     """Parts one garment from another one that is worn below it, where their triangles cut each other.
 
-    Two steps, which the caller calls in this order, and the body has the last word after them: faces that cut are
-    found, exactly; and they are brought apart, each by the shortest way along the normal of the sheet that clears what
-    it cuts deepest. The sheet stays where it is.
+    The caller takes two steps, in this order. Faces that cut are found, exactly. Then they are brought apart, each by
+    the shortest way along the sheet's normal that clears what it cuts deepest. The sheet stays where it is, and the
+    body has the last word after that.
     """
 
     def __init__(self, mesh: Connectivity, rest: Tensor, sheet: Sheet, *, settings: ContactSettings) -> None:
@@ -60,9 +60,9 @@ class Parting:
         return self._count.clone()
 
     def part(self, above: Tensor) -> Tensor:
-        """The outer garment, (V, 3) [m], with faces around there brought to the outer side of what they cut.
+        """The outer garment, (V, 3) [m], with faces at the marked vertices brought to the outer side of what they cut.
 
-        What is marked is what was moved last, so a second call wants another `find`.
+        This leaves only the vertices that it moved last marked, so a second call needs another `find`.
         """
         with torch_stream(self._device):
             self._points.copy_(above)
@@ -76,9 +76,9 @@ class Parting:
         return self._points.clone()
 
     def parted(self, above: Tensor) -> Tensor:
-        """The outer garment, (V, 3) [m], off the sheet by what has few millimetres to go, where that leaves fewer cuts.
+        """The outer garment, (V, 3) [m], moved off the sheet, by `parting_most` at most, if that leaves fewer cuts.
 
-        Where a hand is deep in a hip, the way out of the one leads into the other, and nothing is done.
+        Where a hand is deep in a hip, the way out of one leads into the other, and nothing is done.
         """
         n_before = self.find(above)
         if self._is_serial and not int(n_before):

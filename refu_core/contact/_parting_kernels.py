@@ -16,21 +16,21 @@ class Outer:
     """Its vertices [m]."""
     cut: Cut
     order: wp.array[int]
-    """Its faces, `BLOCK` after `BLOCK` near together."""
+    """Its faces, sorted so that those of each `BLOCK` are near each other."""
     marked: wp.array[float]
-    """1 for corners of faces that cut the sheet, then for whoever was moved last."""
+    """1 for corners of faces that cut the sheet; later, for vertices that were moved last."""
     pulled: wp.array[int]
-    """Whether a vertex is a corner of a face that cuts the sheet still."""
+    """Whether a vertex is a corner of a face that still cuts the sheet."""
     way: wp.array[wp.vec3]
     place: wp.array[wp.vec3]
-    """How far each face has to go [m], and which place of it, in barycentrics."""
+    """The way that each face has to go [m], and the place on it that has to, in barycentrics."""
     count: wp.array[int]
     """Pairs of faces, or faces, that cut each other."""
 
 
 @wp.func
 def corners(face: int, points: wp.array[wp.vec3], faces: wp.array2d[int]) -> wp.mat33:
-    """A triangle, a row a corner."""
+    """A triangle, one row for each corner."""
     return wp.matrix_from_rows(points[faces[face, 0]], points[faces[face, 1]], points[faces[face, 2]])
 
 
@@ -47,7 +47,7 @@ def highest(triangle: wp.mat33) -> wp.vec3:
 @wp.func
 def cut_each_other(face: int, own: wp.mat33, other: wp.mat33, faces: wp.array2d[int]) -> bool:
     """Whether a face cuts the triangle of another mesh."""
-    # The other's edges are looked at from one face alone: any order of their ends will do.
+    # The other triangle's edges are seen from this face alone, so any order of their ends will do.
     order = wp.vec3i(faces[face, 0], faces[face, 1], faces[face, 2])
     edges = meeting_edges(
         order,
@@ -109,7 +109,7 @@ def turned(n: wp.vec3, a: wp.vec3, b: wp.vec3) -> float:
 
 @wp.func
 def shadow(p: wp.vec3, n: wp.vec3, triangle: wp.mat33) -> wp.vec3:
-    """Barycentrics in a triangle of where p is, seen along n; negative ones where it is seen from its edge."""
+    """Barycentrics of p in a triangle, seen along n; negative ones where the triangle is seen edge-on."""
     a = triangle[0]
     b = triangle[1]
     c = triangle[2]
@@ -126,9 +126,10 @@ def is_in(w: wp.vec3) -> bool:
 
 @wp.func
 def depth_below(n: wp.vec3, own: wp.mat33, other: wp.mat33) -> tuple[float, wp.vec3]:
-    """How far a triangle has to go along n to be above the other, and which place of it that is, in barycentrics.
+    """How far a triangle has to go along n to be above the other, and the place on it that is deepest, in barycentrics.
 
-    Over what both cover, seen along n, the difference of their heights is linear: it is largest at a corner of that.
+    Seen along n, the difference of their heights is linear over the area that both cover: it is largest at a corner of
+    that area.
     """
     most = float(0.0)
     place = wp.vec3()
@@ -168,9 +169,9 @@ def depth_below(n: wp.vec3, own: wp.mat33, other: wp.mat33) -> tuple[float, wp.v
 
 @wp.kernel
 def measure_kernel(below: Below, outer: Outer, gap: float, most: float) -> None:
-    """The way of each face with a marked corner out of what it cuts deepest, and the place on it where that is.
+    """For each face with a marked corner, the way out of what it cuts deepest, and the deepest place on it.
 
-    Along the normal of the sheet, as far as clears it, but no farther than `most`. Counts the faces that cut.
+    The way is along the sheet's normal, as far as clears it, but no farther than `most`. Counts the faces that cut.
     """
     face = wp.tid()
     is_marked = float(0.0)
@@ -204,9 +205,9 @@ def measure_kernel(below: Below, outer: Outer, gap: float, most: float) -> None:
 
 @wp.kernel
 def part_kernel(outer: Outer) -> None:
-    """Moves the corners of faces as far as brings their deepest places out; who is moved is marked, and nobody else.
+    """Moves the corners of faces so that their deepest places come out, and marks only the vertices that it moves.
 
-    A face that cut has a corner that is moved. Where no corner was, there is nothing new to measure.
+    Every face that cut has a corner that is moved. A face without one has nothing new to measure.
     """
     i = wp.tid()
     outer.marked[i] = 0.0

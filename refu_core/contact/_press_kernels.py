@@ -6,15 +6,15 @@ from refu_core.body._bundle_kernels import Bundles, greater, is_near, lesser
 
 wp.set_module_options({"enable_backward": False})
 
-WANTED = wp.constant(0)  # limbs that may be near any vertex, as bits
-NEAR = wp.constant(1)  # vertices that any of them may be near
-PRESSED = wp.constant(2)  # vertices that limbs draw back, and on a CPU those that sweeps reach from there
+WANTED = wp.constant(0)  # limbs that may be near some vertex, as bits
+NEAR = wp.constant(1)  # vertices that some limb may be near
+PRESSED = wp.constant(2)  # vertices that limbs draw back, and on a CPU also those that sweeps reach from them
 N_COUNTS = 3
 
 
 @wp.struct
 class Feel:
-    """What is read of `ContactSettings`."""
+    """The `ContactSettings` that the kernels read."""
 
     room: wp.float32
     beside: wp.float32
@@ -37,29 +37,29 @@ class Fabric:
     ring_start: wp.array[int]
     ring: wp.array[int]
     boxed: wp.array[int]
-    """Limbs that may be near the piece of each of `near`, as bits."""
+    """For each vertex in `near`, the limbs that may be near it, as bits."""
     near: wp.array[int]
     rows: wp.array[int]
-    """On a CPU the vertices that are drawn back; on a GPU all."""
+    """On a CPU the vertices that are drawn back; a GPU goes through all."""
     cut: wp.array[float]
     spread: wp.array[float]
-    """How far each vertex is drawn back [m], and the same a sweep later; on a CPU, and a sweep before."""
+    """How far each vertex is drawn back [m], and the same a sweep later; on a CPU, a sweep before."""
     front: wp.array[int]
-    """On a CPU the vertices that were drawn back farther in this sweep, after those of the last one."""
+    """On a CPU the vertices drawn back farther in this sweep and in the last one, each in one half."""
     in_front: wp.array[int]
-    """The last sweep after which a vertex was there, counted from 1."""
+    """The last sweep that put a vertex into `front`, counted from 1."""
     counts: wp.array[int]
 
 
 @wp.func
 def beside(height: float, feel: Feel) -> float:
-    """How far beside a limb cloth at such a height feels it [m]."""
+    """How far to the side of a limb cloth at this height feels it [m]."""
     return wp.min(feel.beside, 2.0 * height * height / feel.lies)
 
 
 @wp.kernel
 def look_kernel(fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
-    """Lists the vertices of one piece a thread that may feel a limb, by boxes."""
+    """Lists the vertices that may feel a limb, by boxes; one piece a thread."""
     i = wp.tid()
     first = fabric.start[i]
     last = fabric.start[i + 1]
@@ -99,10 +99,10 @@ def look_kernel(fabric: Fabric, bundles: Bundles, feel: Feel) -> None:
 
 @wp.func
 def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None:
-    """How far a vertex is drawn back to the skin that it lies on: before a limb that comes in between.
+    """How far a vertex is drawn back to the skin that it lies on, to stay in front of a limb that comes in between.
 
-    Whatever is on the way within `beside` is in between the less the farther beside it is. The way is looked along as
-    a ray is marched along: by as much as nothing is near.
+    A limb within `beside` of the line from skin to vertex counts as in between, the less the farther to the side it is.
+    The line is searched by ray marching: each step is as long as the limb is far away.
     """
     way = fabric.points[v] - fabric.skin[v]
     height = wp.length(way)
@@ -114,7 +114,7 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
             at = float(0.0)
             while at < least:
                 here = fabric.skin[v] + (at / height) * way
-                off = aside * (least - at) / (whole - at)  # what is farther off than that says nothing new
+                off = aside * (least - at) / (whole - at)  # a limb farther off than this changes nothing
                 hit = wp.mesh_query_point_no_sign(limbs[k], here, off)
                 if hit.result:
                     off = wp.min(off, wp.length(wp.mesh_eval_position(limbs[k], hit.face, hit.u, hit.v) - here))
@@ -132,7 +132,7 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
 
 @wp.kernel
 def spread_kernel(fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.array[float]) -> None:
-    """A vertex is drawn back as far as a neighbour of it, less `slope` times the way from there: a dent, not a tear."""
+    """A vertex is drawn back as far as a neighbour, less `slope` times the way from there: a dent, not a tear."""
     v = wp.tid()
     most = cut[v]
     for k in range(fabric.ring_start[v], fabric.ring_start[v + 1]):
@@ -143,7 +143,7 @@ def spread_kernel(fabric: Fabric, slope: float, cut: wp.array[float], wider: wp.
 
 @wp.func
 def lower(v: int, fabric: Fabric, feel: Feel) -> None:
-    """Draws a vertex back towards the skin, of which it keeps half the room off if it was."""
+    """Draws a vertex back towards the skin, but no nearer than half the room, unless it was nearer before."""
     if fabric.cut[v] > 0.0:
         way = fabric.points[v] - fabric.skin[v]
         height = wp.length(way)
@@ -153,7 +153,7 @@ def lower(v: int, fabric: Fabric, feel: Feel) -> None:
 
 @wp.kernel
 def press_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None:
-    """`press` of one vertex a thread."""
+    """`press`, one vertex a thread."""
     i = wp.tid()
     if i < fabric.counts[NEAR]:
         press(fabric.near[i], fabric, limbs, feel)
@@ -161,13 +161,13 @@ def press_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> None
 
 @wp.kernel
 def lower_kernel(fabric: Fabric, feel: Feel) -> None:
-    """`lower` of one vertex a thread."""
+    """`lower`, one vertex a thread."""
     lower(wp.tid(), fabric, feel)
 
 
 @wp.kernel
 def press_all_kernel(fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel, sweeps: int, reach: int) -> None:
-    """All that follows, by one thread: sweeps go on from those that the last one has drawn back farther."""
+    """All steps after `look_kernel`, by one thread; a sweep goes on from vertices the last one drew back farther."""
     for i in range(fabric.counts[NEAR]):
         press(fabric.near[i], fabric, limbs, feel)
     n_front = int(fabric.counts[PRESSED])

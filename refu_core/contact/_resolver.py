@@ -38,7 +38,7 @@ class Resolution(NamedTuple):
 
     @property
     def n_pushed(self) -> int:
-        """Vertices nearer than the margin before, that were moved."""
+        """Vertices that were nearer than the margin before, and were moved."""
         return int(self.numbers[1])
 
     @property
@@ -55,12 +55,13 @@ class Resolution(NamedTuple):
 class Resolver:
     """Brings one garment off posed bodies.
 
-    The steps: where an approximate distance has missed the closest face, a neighbour names it; vertices nearer than the
-    margin are pushed along the gradient (ReFU, paper, Eq. 2); their neighbours give way; edges that still run too low
-    are raised. What depends on other vertices is one launch, so their order plays no role.
+    The steps: where an approximate distance has missed the closest face, a neighbour's face leads to it; vertices
+    nearer than the margin are pushed along the gradient (ReFU, paper, Eq. 2); their neighbours give way; edges that
+    still run too low are raised. A step that depends on other vertices is a step of its own, so the order of vertices
+    plays no role.
 
-    On a CPU, steps that concern no vertex are left out. A GPU would have to be waited for to know, so it gets the same
-    launches in every frame, as a CUDA graph needs them, and the numbers of a `Resolution` stay there.
+    On a CPU, steps that concern no vertex are left out. To know that, a GPU would have to be waited for. So it gets the
+    same launches in every frame, as a CUDA graph needs, and the numbers of a `Resolution` stay on it.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class Resolver:
         """For garments of these `faces`, shape (G, 3), and `n_vertices` N, on the device of the faces.
 
         Raises:
-            MeshError: a face that names a vertex there isn't.
+            MeshError: a face that names a vertex that doesn't exist.
         """
         self._settings = settings
         self.device = faces.device if isinstance(faces, Tensor) else torch.device("cpu")
@@ -112,15 +113,15 @@ class Resolver:
         Args:
             points: Garment vertices [m], shape (N, 3).
             sdf: The body's signed distance.
-            start: What it says of the points; what is beyond `margin` + `ASKED_FROM` may be clipped from above. None
-                goes on from what the last call ended with, if that was for the same body: only points that were moved
-                since, and may have come that near, are asked.
+            start: What `sdf` says of the points; distances beyond `margin` + `ASKED_FROM` may be clipped from above.
+                None goes on from where the last call ended, if that was for the same body: only points that were moved
+                since, and may have come that near, are queried.
             margin: ε ≥ 0 [m].
             scale: α of the first push: one number, or a function of vertices and their distances.
 
         Raises:
-            MeshError: points of another number or type, or not finite, a negative margin, a distance that isn't one to
-                faces, or no start though the last call wasn't for this `sdf`.
+            MeshError: points that are of the wrong number or type, or not finite; a negative margin; a distance that
+                isn't to faces; or no start though the last call wasn't for this `sdf`.
         """
         require_tensor("points", points)
         distances = self._floats["distance"] if start is None else start.distance
@@ -151,7 +152,7 @@ class Resolver:
             else:
                 self._floats["first"].copy_(start.distance)
                 self._vectors["first_gradient"].copy_(start.gradient)
-                torch.clamp(start.face, max=len(sdf.faces) - 1, out=self._ints["first_face"])  # nor of another body
+                torch.clamp(start.face, max=len(sdf.faces) - 1, out=self._ints["first_face"])  # maybe of another body
                 self._run("begin")
             if not sdf.is_exact:
                 self._reconcile()
@@ -169,7 +170,7 @@ class Resolver:
         return Resolution(self._vectors["place"].clone(), self._floats["distance"].clone(), numbers)
 
     def _reconcile(self) -> None:
-        """Where distances contradict each other along an edge, a closest face was missed."""
+        """Finds closest faces that were missed, where distances along an edge contradict each other."""
         self._run("compare")
         for _ in range(self._settings.max_pushes):
             n = self._length(_state.SUSPECTS)
@@ -218,7 +219,7 @@ class Resolver:
             self._run("lift")
 
     def _length(self, which: int) -> int:
-        """How long a list of vertices is; on a GPU, which closes it, how long it may become."""
+        """The length of a list of vertices; on a GPU, where this closes it, the most that it can be."""
         if self._is_serial:
             return self._count(which)
         self._close(which)
@@ -231,7 +232,7 @@ class Resolver:
         return int(self._read_counts[which])
 
     def _run(self, name: str, parameter: tuple[int, int] | None = None) -> None:
-        """Launches a step, with one of its parameters, by position, set anew."""
+        """Launches a step; `parameter` is the position and new value of one of its parameters."""
         if parameter is not None:
             self._commands[name].set_param_at_index(*parameter)
         self._commands[name].launch()
@@ -244,7 +245,7 @@ class Resolver:
         return self._known[skin, margin]
 
     def _recorded(self, skin: Any, margin: float) -> dict[str, Any]:
-        """The launches of a frame, by name: on a CPU by one thread, which goes through all."""
+        """The launches of a frame, by name; on a CPU each is one thread, which goes through everything."""
         how, state, cloth, n = self._settings, self._state, self._cloth, self._n_vertices
         rules = _state.Rules()
         rules.margin, rules.tolerance, rules.max_displacement = margin, how.tolerance, how.max_displacement
@@ -296,7 +297,7 @@ class Resolver:
 ASKED_FROM = 2e-3
 """Vertices are asked for their exact distance up to this far beyond the margin [m]."""
 _MOST_MARGINS = 8
-"""Margins whose launches are kept: of an outer garment there are two a frame."""
+"""How many margins' launches are kept; an outer garment has two margins a frame."""
 _VECTORS = ("origin", "first_gradient", "place", "gradient", "field", "smoother")
 _FLOATS = ("first", "distance", "way", "goal", "alpha", "largest")
 _INTS = ("first_face", "face", "mark", "fresh", "near", "reached", "moved")
@@ -305,7 +306,7 @@ _INTS = ("first_face", "face", "mark", "fresh", "near", "reached", "moved")
 def _cloth(mesh: Connectivity, device: torch.device) -> Any:
     """The garment as the kernels read it."""
     owner, ring = mesh.ring.owner, mesh.ring.items
-    # The sums over neighbours are rounded in this order: those of a higher number first.
+    # The order of neighbours decides how sums over them are rounded: those with a higher number than the vertex first.
     ring = ring[np.lexsort((ring < owner, owner))]
     cloth = _state.Cloth()
     cloth.ring_start, cloth.ring, cloth.edges = (ints(one, device) for one in (mesh.ring.start, ring, mesh.edges))

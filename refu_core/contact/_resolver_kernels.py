@@ -29,9 +29,9 @@ wp.set_module_options({"enable_backward": False})
 def push_on(
     i: int, here: wp.vec3, distance: float, gradient: wp.vec3, scale: float, state: State, skin: Skin, rules: Rules
 ) -> None:
-    """Pushes a vertex from `here` until it is clear, and keeps the best place; half as far once it is thrown back."""
+    """Pushes a vertex from `here` until it is clear, keeping the best place; half as far once the gradient reverses."""
     goal = wp.min(distance + scale * (rules.margin - distance), rules.margin) - rules.tolerance
-    # One loop with one call of `query_skin`, here as elsewhere: so its code is there once.
+    # One loop with a single call of `query_skin`, here as elsewhere, so that its code is generated once.
     for _round in range(rules.max_pushes):
         if distance < rules.margin:
             offset = scale * (rules.margin - distance)
@@ -48,7 +48,7 @@ def push_on(
 
 @wp.func
 def contradict(i: int, j: int, state: State, rules: Rules) -> bool:
-    """Whether the distances of two neighbours, one of them at the skin, differ by more than they are apart."""
+    """Whether the distances of two neighbours, one of them at the skin, differ by more than their edge's length."""
     first = state.distance[i]
     second = state.distance[j]
     excess = wp.abs(first - second) - rules.tolerance
@@ -63,7 +63,7 @@ def suspect(i: int, state: State) -> None:
 
 @wp.kernel
 def begin_kernel(each: int, state: State) -> None:
-    """Everybody where it is; `each` vertices a thread, here and where else all are gone through (`strips`)."""
+    """Starts every vertex where it is; `each` vertices a thread, as in every kernel for all vertices (`strips`)."""
     first = wp.tid() * each
     for i in range(first, first + each):
         keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
@@ -74,7 +74,7 @@ def begin_kernel(each: int, state: State) -> None:
 
 @wp.kernel
 def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
-    """From where the last call ended: who was moved since, and may have come within `reach`, is asked."""
+    """Goes on from where the last call ended: queries vertices that moved since and may have come within `reach`."""
     first = wp.tid() * each
     for i in range(first, first + each):
         here = state.origin[i]
@@ -109,9 +109,9 @@ def compare_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
 
 @wp.kernel
 def retry_kernel(each: int, state: State, cloth: Cloth, skin: Skin, rules: Rules) -> None:
-    """From the faces of neighbours that are nearer to theirs, a nearer one than a suspect's own may be found.
+    """Queries each suspect from the faces of neighbours that are nearer to the skin, which may lead to a nearer face.
 
-    `each` of a list a thread, here and below.
+    `each` entries of a list a thread, here and below.
     """
     begin = wp.tid() * each
     for n in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
@@ -130,7 +130,7 @@ def retry_kernel(each: int, state: State, cloth: Cloth, skin: Skin, rules: Rules
 
 @wp.kernel
 def adopt_kernel(each: int, state: State, cloth: Cloth) -> None:
-    """Takes over what was found, and suspects the neighbours of what changed."""
+    """Takes over what was found, and suspects the neighbours of vertices that changed."""
     begin = wp.tid() * each
     for n in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
         i = state.reached[n]
@@ -145,7 +145,7 @@ def adopt_kernel(each: int, state: State, cloth: Cloth) -> None:
 
 @wp.kernel
 def list_near_kernel(each: int, state: State, rules: Rules) -> None:
-    """Lists who is nearer than the margin, of those who were moved."""
+    """Lists the vertices that are nearer than the margin, of those that were moved."""
     first = wp.tid() * each
     for i in range(first, first + each):
         state.mark[i] = 0
@@ -155,7 +155,7 @@ def list_near_kernel(each: int, state: State, rules: Rules) -> None:
 
 @wp.kernel
 def scale_kernel(each: int, state: State, rules: Rules) -> None:
-    """How far each near vertex goes, for predicted scales: at least until it is outside."""
+    """How far each near vertex goes by its predicted scale: at least until it is outside."""
     begin = wp.tid() * each
     for k in range(begin, wp.min(begin + each, length(NEAR, state))):
         i = state.near[k]
@@ -173,7 +173,7 @@ def scale_kernel(each: int, state: State, rules: Rules) -> None:
 
 @wp.func
 def reach(i: int, state: State, cloth: Cloth) -> None:
-    """Lists the neighbours of a vertex, unless they are."""
+    """Lists the neighbours of a vertex that aren't listed yet."""
     for k in range(cloth.ring_start[i], cloth.ring_start[i + 1]):
         j = cloth.ring[k]
         if state.mark[j] == 0 and wp.atomic_max(state.mark, j, BESIDE) == 0:
@@ -184,7 +184,7 @@ def reach(i: int, state: State, cloth: Cloth) -> None:
 def spread(
     i: int, state: State, cloth: Cloth, step: float, field: wp.array[wp.vec3], smoother: wp.array[wp.vec3]
 ) -> None:
-    """A step towards the mean of the neighbours, but no less than a vertex has to go."""
+    """A step towards the mean of the neighbours; a pushed vertex still goes at least as far as it has to."""
     first = cloth.ring_start[i]
     last = cloth.ring_start[i + 1]
     mean = wp.vec3()
@@ -202,7 +202,7 @@ def spread(
 
 @wp.kernel
 def blend_kernel(state: State, cloth: Cloth, near: int, sweeps: int, long_step: float, short_step: float) -> None:
-    """All sweeps, in pairs, by one thread: lists are short, a launch costs what hundreds of steps do."""
+    """All sweeps, in pairs, by one thread: lists are short, and a launch costs as much as hundreds of steps."""
     first = int(0)
     for _ring in range(near):
         last = int(state.counts[REACHED])
@@ -219,7 +219,7 @@ def blend_kernel(state: State, cloth: Cloth, near: int, sweeps: int, long_step: 
 
 @wp.func
 def settle(i: int, state: State, skin: Skin, rules: Rules) -> None:
-    """Takes a vertex along, and pushes it on if it isn't clear yet. Leaves fields and marks empty."""
+    """Moves a vertex by `field`, and pushes it on if it isn't clear yet. Leaves fields and marks empty."""
     shift = state.field[i]
     mark = state.mark[i]
     state.field[i] = wp.vec3()
@@ -256,7 +256,7 @@ def settle(i: int, state: State, skin: Skin, rules: Rules) -> None:
 
 @wp.kernel
 def settle_kernel(each: int, state: State, skin: Skin, rules: Rules) -> None:
-    """`settle` for a list, `each` of it a thread."""
+    """`settle` for the vertices reached, `each` of them a thread."""
     begin = wp.tid() * each
     for k in range(begin, wp.min(begin + each, length(REACHED, state))):
         settle(state.reached[k], state, skin, rules)
@@ -264,7 +264,7 @@ def settle_kernel(each: int, state: State, skin: Skin, rules: Rules) -> None:
 
 @wp.kernel
 def tally_kernel(each: int, state: State) -> None:
-    """Counts who was inside, who was moved, and who is inside."""
+    """Counts the near vertices that were inside, that were moved, and that are still inside."""
     begin = wp.tid() * each
     for k in range(begin, wp.min(begin + each, length(NEAR, state))):
         i = state.near[k]

@@ -1,4 +1,4 @@
-"""Launches of a GPU for what a CPU does in one; in a module of their own, which a CPU needn't compile."""
+"""A GPU's launches for what a CPU does in one; in a module of their own, which a CPU needn't compile."""
 
 import warp as wp
 
@@ -12,14 +12,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def close_kernel(state: State, which: int) -> None:
-    """From now on launches go through a list as long as it is now, whatever is added to it meanwhile."""
+    """From now on launches go through a list up to its present end, whatever is added to it meanwhile."""
     state.begins[which] = state.ends[which]
     state.ends[which] = state.counts[which]
 
 
 @wp.kernel
 def reach_kernel(state: State, cloth: Cloth) -> None:
-    """Lists the neighbours of those that came to the list last."""
+    """Lists the neighbours of the vertices that were listed last."""
     i = listed(state.begins[REACHED] + wp.tid(), REACHED, state.reached, state)
     if i >= 0:
         reach(i, state, cloth)
@@ -39,7 +39,7 @@ def spread_kernel(
 def measure_kernel(
     state: State, cloth: Cloth, skin: Skin, rules: Rules, rounds: int, suspects: wp.array[int], low: wp.array[int]
 ) -> None:
-    """Lists those of the edges that are low."""
+    """Lists the suspected edges that are too low."""
     edge = listed(wp.tid(), CUTTING + rounds, suspects, state)
     if edge >= 0:
         measure(edge, rounds, state, cloth, skin, rules, low)
@@ -47,7 +47,7 @@ def measure_kernel(
 
 @wp.kernel
 def choose_kernel(state: State, cloth: Cloth, rounds: int, low: wp.array[int]) -> None:
-    """Lists their ends."""
+    """Lists the ends of edges that are too low."""
     k = wp.tid()
     if listed(k, CUTTING + 1 + rounds, low, state) >= 0:
         choose(k, state, cloth, low)
@@ -55,7 +55,7 @@ def choose_kernel(state: State, cloth: Cloth, rounds: int, low: wp.array[int]) -
 
 @wp.kernel
 def lift_kernel(state: State, skin: Skin, rules: Rules) -> None:
-    """Raises these."""
+    """Raises the listed ends."""
     i = listed(wp.tid(), RAISED, state.reached, state)
     if i >= 0:
         lift(i, state, skin, rules)

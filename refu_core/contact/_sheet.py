@@ -1,4 +1,4 @@
-"""What a garment is brought off by its triangles: a garment below it, or the body, in whatever pose came last."""
+"""A mesh whose triangles a garment is brought off: a garment below it, or the body, in the pose that came last."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Sheet:
         self._normals = torch.empty_like(self.vertices)
         self._extent = memory(2, 3, device=rest.device)
         self.data = data = kernels.Below()
-        """As kernels read it; `fit` its tree first."""
+        """The mesh as kernels read it; `fit` its tree first."""
         data.points, data.normals, data.extent = (
             as_warp(tensor, wp.vec3) for tensor in (self.vertices, self._normals, self._extent)
         )

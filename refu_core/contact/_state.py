@@ -1,38 +1,38 @@
 """What the steps of a `Resolver` read and write: a garment, a frame of it, and numbers.
 
-Lists of vertices are filled by kernels: `counts[NAME]` says how many they are. On a CPU they are in order, on a GPU in
-any; nothing depends on it. On a CPU one thread goes through a list. To know how long it is a GPU would have to be
-waited for: there a launch is as long as any list can be, and what is beyond its list's end does nothing.
+Kernels fill lists of vertices, and `counts[NAME]` is the length of each. On a CPU a list is in order, on a GPU in any
+order; nothing depends on it. On a CPU one thread goes through a list. To know the length of a list, a GPU would have to
+be waited for. So its launches have as many threads as the list may have entries, and those beyond its end do nothing.
 """
 
 import warp as wp
 
 # What a kernel counts.
 NEAR = wp.constant(0)  # vertices nearer than the margin, which are pushed
-REACHED = wp.constant(1)  # vertices that a push reaches by way of its neighbours
+REACHED = wp.constant(1)  # vertices that are pushed, or that a push reaches through neighbours
 SUSPECTS = wp.constant(2)  # vertices at the ends of edges along which distances contradict each other
 INSIDE = wp.constant(3)
-MOVED = wp.constant(4)  # of those nearer than the margin
-STUCK = wp.constant(5)  # inside after all
+MOVED = wp.constant(4)  # vertices nearer than the margin that were moved
+STUCK = wp.constant(5)  # vertices still inside at the end
 RAISED = wp.constant(6)  # ends of edges that cut the skin
 CHANGED = wp.constant(7)  # distances that were replaced
 SHIFTED = wp.constant(8)  # vertices that were moved since the last call
-CUTTING = wp.constant(9)  # such edges; a number for each of `max_pushes` rounds follows
+CUTTING = wp.constant(9)  # edges that may cut the skin; the counts of `max_pushes` rounds follow
 
-# A vertex reached by pushes, or pushed itself.
+# Marks of a vertex: reached by a push, or pushed itself.
 BESIDE = wp.constant(1)
 SOURCE = wp.constant(2)
 
 
 @wp.struct
 class Cloth:
-    """What doesn't change of a garment."""
+    """The part of a garment that doesn't change."""
 
     ring_start: wp.array[wp.int32]
     ring: wp.array[wp.int32]
     """The neighbours of vertex i are `ring[ring_start[i]:ring_start[i + 1]]`."""
     edges: wp.array2d[wp.int32]
-    """Each edge once, lower vertex first; those of vertex i from `edge_start[i]` on."""
+    """Each edge once, lower vertex first; those whose lower vertex is i begin at `edge_start[i]`."""
     edge_start: wp.array[wp.int32]
 
 
@@ -52,53 +52,53 @@ class State:
     """A garment in one frame, by vertex; lengths in metres."""
 
     origin: wp.array[wp.vec3]
-    """Before; there it has this distance:"""
+    """Where each vertex was before. The `first` distance, gradient and face are those there."""
     first: wp.array[wp.float32]
     first_gradient: wp.array[wp.vec3]
     first_face: wp.array[wp.int32]
     place: wp.array[wp.vec3]
-    """The best place so far; there it has this distance:"""
+    """The best place so far. The distance, gradient and face that follow are those there."""
     distance: wp.array[wp.float32]
     gradient: wp.array[wp.vec3]
     face: wp.array[wp.int32]
     way: wp.array[wp.float32]
     """How far a vertex has to go along the gradient."""
     goal: wp.array[wp.float32]
-    """Distance that this leads to."""
+    """The distance from the skin that this leads to."""
     mark: wp.array[wp.int32]
     fresh: wp.array[wp.int32]
-    """Whether a vertex isn't where the last call left it: others were brought off the skin as far as they can be."""
+    """Whether a vertex isn't where the last call left it. The others are as far off the skin as they can be."""
     counts: wp.array[wp.int32]
     begins: wp.array[wp.int32]
     ends: wp.array[wp.int32]
-    """Where launches begin and end to go through each list, on a GPU; `_round_kernels.close_kernel` says so."""
+    """On a GPU, the part of each list that launches go through; `_round_kernels.close_kernel` sets it."""
     near: wp.array[wp.int32]
     reached: wp.array[wp.int32]
-    """The lists; `reached` serves as that of suspects before, and of raised ends after."""
+    """The lists; `reached` also holds the suspects before a push, and the raised ends of edges after it."""
     alpha: wp.array[wp.float32]
-    """Scale of each of the near ones."""
+    """The scale α of each vertex in `near`."""
     field: wp.array[wp.vec3]
     smoother: wp.array[wp.vec3]
-    """How far vertices are taken along, and the same a sweep later; zero in between frames."""
+    """How far vertices are taken along, and the same a sweep later; zero between frames."""
     moved: wp.array[wp.int32]
     """Whether the end of an edge was raised in the last round."""
     suspects: wp.array[wp.int32]
     deficit: wp.array[wp.float32]
     rise: wp.array[wp.vec3]
-    """Edges that may run too low; how much those lack that do, and the way up."""
+    """Edges that may run too low; for those that do, how much they lack, and the way up."""
     largest: wp.array[wp.float32]
-    """The largest of those at each vertex."""
+    """The largest deficit of the edges at each vertex."""
 
 
 @wp.func
 def length(which: int, state: State) -> int:
-    """Of a list; on a GPU, as it was when it was closed."""
+    """The length of a list; on a GPU, when it was closed."""
     return wp.min(state.ends[which], state.counts[which])
 
 
 @wp.func
 def listed(k: int, which: int, rows: wp.array[int], state: State) -> int:
-    """Number k of a list; -1 beyond its end."""
+    """Entry k of a list, -1 beyond its end."""
     if k < state.ends[which]:
         return rows[k]
     return -1

@@ -14,10 +14,11 @@ from refu_core.mesh import Connectivity
 
 
 class StrainLimit:
-    """Draws the ends of edges together that contact has made longer than a multiple of their rest length.
+    """Draws together the ends of edges that contact has made longer than a multiple of their rest length.
 
-    Jacobi sweeps of position-based dynamics (Müller et al. 2007): edges pull by half of what they are too long, and a
-    vertex goes by the mean of its edges. The result is continuous in the vertices, and edges within the limit stay.
+    Jacobi sweeps of position-based dynamics (Müller et al. 2007): edges pull by half of their excess length, and a
+    vertex moves by the mean over its edges. The result is continuous in the vertices, and edges within the limit don't
+    pull.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class StrainLimit:
 
     @torch.no_grad()
     def __call__(self, points: Tensor, before: Tensor, rest: Tensor) -> Tensor:
-        """The garment (N, 3) [m] with no tear in it; on a CPU the very points where there was none.
+        """The garment (N, 3) [m] with no tear in it; on a CPU `points` itself if there was none.
 
         `before` (N, 3) [m] are its vertices before contact, `rest` (N, 3) [m] those of the wearer's garment at rest.
         """

@@ -41,9 +41,9 @@ def is_long(v: int, w: int, points: wp.array[wp.vec3], net: Net) -> bool:
 
 @wp.func
 def drawn(v: int, points: wp.array[wp.vec3], net: Net) -> wp.vec3:
-    """Where its edges draw a vertex: by half of what each is too long, on average.
+    """Where a vertex's edges draw it: by half of the excess length of each, on average.
 
-    Edges that aren't too long count, too: so a vertex that was thrown comes back, and its neighbours hardly follow it.
+    Edges that aren't too long count, too: so a vertex that was thrown out comes back, and its neighbours hardly follow.
     """
     total = wp.vec3()
     for r in range(net.cut.ring_start[v], net.cut.ring_start[v + 1]):
@@ -65,14 +65,14 @@ def enlist(v: int, net: Net) -> None:
 
 @wp.kernel
 def sweep_kernel(net: Net, points: wp.array[wp.vec3], other: wp.array[wp.vec3]) -> None:
-    """A sweep, a vertex a thread."""
+    """One sweep, one vertex a thread."""
     v = wp.tid()
     other[v] = drawn(v, points, net)
 
 
 @wp.kernel
 def limit_kernel(net: Net, sweeps: int) -> None:
-    """All sweeps, by one thread: over the ends of edges that are too long, and of those that become it."""
+    """All sweeps, by one thread: over the ends of edges that are too long, or become so."""
     for v in range(net.points.shape[0]):
         if net.points[v] == net.before[v]:
             continue  # an edge that contact has made longer has an end that was moved

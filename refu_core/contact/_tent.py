@@ -15,12 +15,12 @@ from refu_core.garments import GarmentTemplate
 from refu_core.skeleton import JOINT_NAMES
 
 _BACKWARDS = np.array([0.0, 0.0, -1.0])
-"""In the T-pose, SMPL axes."""
+"""The way backwards in the T-pose, in SMPL axes."""
 _BONES = [[JOINT_NAMES.index(f"{side}_{joint}") for joint in ("knee", "ankle")] for side in ("left", "right")]
 
 
 class Shins:
-    """How the lower legs of one posed body stand: one for all garments on it."""
+    """How the lower legs of one posed body stand, shared by all garments on it."""
 
     def __init__(self, body: SmplBody) -> None:
         """For poses of this body, on its device."""
@@ -32,17 +32,17 @@ class Shins:
         for knee, ankle in _BONES:
             (own,) = np.nonzero(owner == knee)
             places = np.stack([self._joints[knee], self._joints[ankle], self._joints[knee] + _BACKWARDS])
-            # What moves the skin by an affine map moves these places by the same.
+            # An affine map that moves the skin moves these places by the same map.
             shares.append(np.linalg.pinv(np.c_[skin[own], np.ones(len(own))]).T @ np.c_[places, np.ones(3)].T)
             of_legs.append(own)
             bone = places[1] - places[0]
             off = np.linalg.norm(np.cross(skin[own] - places[0], bone), axis=1) / np.linalg.norm(bone)
             radii.append(off.mean() if len(own) else np.inf)  # without skin there is no tent
         self.radius = np.array(radii)
-        """How far the skin of each is from its bone at rest, on average [m]."""
+        """How far the skin of each lower leg is from its bone at rest, on average [m]."""
         name = str(self._device)
         self.data = data = kernels.ShinMeans()
-        """As kernels read it."""
+        """The same as kernels read it."""
         data.start = ints(np.cumsum([0, *map(len, of_legs)]), name)
         data.vertex = ints(np.concatenate(of_legs), name)
         data.share = wp.array2d(np.concatenate(shares), dtype=wp.float32, device=name)
@@ -70,15 +70,15 @@ class Shins:
 class Tent:
     """Keeps cloth that hangs behind the legs at rest behind the shins in any pose (docs/architecture.md).
 
-    It goes backwards, out of a tent over each shin, by the shortest way out of both: all the way where at rest it
-    is farther behind the bone than the tent is wide, other cloth by less, and none at rest.
+    The cloth moves backwards, out of a tent over each shin, by the shortest way out of both. It goes all the way where
+    at rest it is farther behind the bone than the tent is wide; other cloth goes less far. In the rest pose none moves.
     """
 
     def __init__(self, garment: GarmentTemplate, shins: Shins) -> None:
         """For a garment on the body whose shins these are."""
         self._device = garment.v_template.device
         at_rest = shins.behind(garment.v_template.detach().cpu().double().numpy())
-        # What hangs from both legs goes as far with either.
+        # Cloth that hangs from both legs follows either in full.
         follows = np.minimum(2 * weight_of_parts(garment.weights, LEGS).cpu().numpy(), 1)
         weight = np.clip(at_rest / shins.radius, 0, 1) * follows
         (rows,) = np.nonzero(weight.max(1))
@@ -94,7 +94,7 @@ class Tent:
 
     @torch.no_grad()
     def __call__(self, points: Tensor) -> Tensor:
-        """The garment (N, 3) [m] out of the tents over the shins as they are. Not differentiable."""
+        """The garment (N, 3) [m] brought out of the tents over the shins. Not differentiable."""
         self._cloth.copy_(points)
         with torch_stream(self._device):
             self._pitch.launch()

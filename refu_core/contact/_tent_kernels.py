@@ -20,16 +20,16 @@ class ShinMeans:
     vertex: wp.array[int]
     """Skin of leg i: `vertex[start[i]:start[i + 1]]`."""
     share: wp.array2d[float]
-    """What each of its vertices adds to each of the places, shape (n, N_PLACES)."""
+    """The weight of each of these vertices in each of the places, shape (n, N_PLACES)."""
     radius: wp.array[float]
     """How far a leg's skin is from its bone at rest [m]."""
     places: wp.array2d[wp.vec3]
-    """Of each leg [m]."""
+    """The places of each leg [m]."""
 
 
 @wp.kernel
 def stand_kernel(body: wp.array[wp.vec3], shins: ShinMeans) -> None:
-    """Knee, ankle, and the way backwards, a unit vector square to the bone, of one leg a thread."""
+    """Knee, ankle, and the way backwards, a unit vector at right angles to the bone; one leg a thread."""
     leg = wp.tid()
     knee = wp.vec3()
     ankle = wp.vec3()
@@ -48,10 +48,10 @@ def stand_kernel(body: wp.array[wp.vec3], shins: ShinMeans) -> None:
 
 @wp.func
 def lack_behind(at: wp.vec3, at_rest: float, leg: int, shins: ShinMeans) -> float:
-    """How far a place is before the tent over a leg, seen along the way backwards [m]; negative behind it.
+    """How far a place has to go along the way backwards to be behind the tent over a leg [m]; negative behind it.
 
-    The tent is a circle around the bone, and from its sides on the tangents at 45 degrees. Nothing has to be farther
-    behind the bone than it is at rest.
+    The tent is a circle around the bone, continued at its sides by the tangents at 45 degrees. Nothing has to be
+    farther behind the bone than it is at rest.
     """
     knee = shins.places[leg, _KNEE]
     bone = shins.places[leg, _ANKLE] - knee
@@ -72,7 +72,7 @@ def lack_behind(at: wp.vec3, at_rest: float, leg: int, shins: ShinMeans) -> floa
 def least_way(left: wp.vec3, n_left: float, right: wp.vec3, n_right: float) -> wp.vec3:
     """The shortest vector that goes `n_left` or more along the unit vector `left`, and `n_right` along `right`.
 
-    Of ways that lead apart it is the sum, or it would know no bound.
+    Where the directions point apart it is the sum of both ways; otherwise it could grow without bound.
     """
     both = wp.max(wp.dot(left, right), 0.0)
     if n_left <= 0.0 and n_right <= 0.0:
@@ -93,12 +93,12 @@ class Hanging:
     at_rest: wp.array2d[float]
     """How far each is behind each leg's bone at rest [m]."""
     weight: wp.array2d[float]
-    """What share of the way out of each leg's tent it goes."""
+    """What share of the way out of each leg's tent each goes."""
 
 
 @wp.kernel
 def tent_kernel(hanging: Hanging, shins: ShinMeans, each: int, cloth: wp.array[wp.vec3]) -> None:
-    """Brings `each` of the hanging vertices a thread out of the tents over both legs."""
+    """Brings the hanging vertices out of the tents over both legs; `each` of them a thread."""
     first = wp.tid() * each
     for i in range(first, wp.min(first + each, hanging.vertex.shape[0])):
         v = hanging.vertex[i]

@@ -1,4 +1,4 @@
-"""Cloth that was predicted folded over itself, levelled before anything is worn over it."""
+"""Levels cloth that was predicted folded over itself, before anything is worn over it."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from refu_core.garments import GarmentTemplate
 class Unfold:
     """Levels one garment where it has folded over: such a sheet has no outer side to bring another one to.
 
-    Where cloth faces is known without its folds: its normal at rest, turned as skinning turns the vertex. The farther
-    the normal has left that, the more a vertex gives way to its neighbours, and these less and less around it. All of
-    it is continuous, and cloth that faces where it should isn't touched.
+    Which way cloth faces without its folds is known: its normal at rest, turned as skinning turns the vertex. The
+    farther the normal is from that, the more a vertex gives way to its neighbours, and vertices around it less and
+    less. All of this is continuous, and cloth that faces the way it should isn't touched.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Unfold:
 
 
 def _share(garment: GarmentTemplate, others: Sequence[GarmentTemplate], near: float) -> Tensor:
-    """How much each vertex may give way, shape (V,): up to `near` [m] from the `others` at rest 1, twice as far 0."""
+    """How much each vertex may give way, shape (V,): 1 within `near` [m] of the `others` at rest, 0 twice as far."""
     meets = np.concatenate([one.v_template.detach().cpu().double().numpy() for one in others])
     distance = cKDTree(meets).query(garment.v_template.detach().cpu().double().numpy())[0]
     return torch.from_numpy(np.clip(2 - distance / near, 0, 1)).float()

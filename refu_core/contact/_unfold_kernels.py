@@ -15,19 +15,19 @@ class Fold:
 
     cut: Cut
     normal: wp.array[wp.vec3]
-    """Where its vertices face at rest."""
+    """Which way its vertices face at rest."""
     start: wp.array[int]
     joint: wp.array[int]
     weight_of_joint: wp.array[float]
-    """Of the joints `joint[start[v]:start[v + 1]]`, which turn vertex v."""
+    """Weights of the joints `joint[start[v]:start[v + 1]]`, which turn vertex v."""
     rotation: wp.array[wp.mat33]
-    """Of the joints."""
+    """Rotations of the joints."""
     may: wp.array[int]
     """The vertices that may give way."""
     share: wp.array[float]
-    """How much each vertex may, 0 to 1."""
+    """How much each vertex may give way, 0 to 1."""
     weight: wp.array[float]
-    """How much each vertex does."""
+    """How much each vertex gives way."""
     wider: wp.array[float]
     origin: wp.array[wp.vec3]
     points: wp.array[wp.vec3]
@@ -42,9 +42,9 @@ class Fold:
 
 @wp.func
 def facing(i: int, fold: Fold, way: wp.vec3) -> float:
-    """Mean cosine between `way` and the faces around a vertex, by their areas.
+    """Mean cosine between `way` and the normals of the faces around a vertex, weighted by area.
 
-    That is the cosine of its normal where they are in a plane; where they fold the normal leaps, and this doesn't.
+    Where these lie in a plane it is the cosine of the vertex normal. Where they fold the normal leaps; this doesn't.
     """
     along = float(0.0)
     area = float(0.0)
@@ -59,9 +59,9 @@ def facing(i: int, fold: Fold, way: wp.vec3) -> float:
 
 @wp.kernel
 def fold_kernel(each: int, fold: Fold, alike: float) -> None:
-    """How far each vertex has folded over, 0 to its share: by where it is `facing`, and where it should be.
+    """How far each vertex has folded over, 0 to its share, by which way it is `facing` and which way it should.
 
-    Those that have are listed. `each` vertices a thread (`strips`).
+    Vertices that have folded over are listed. `each` vertices a thread (`strips`).
     """
     first = wp.tid() * each
     for k in range(first, first + each):
@@ -76,7 +76,7 @@ def fold_kernel(each: int, fold: Fold, alike: float) -> None:
 
 @wp.func
 def levelled(i: int, points: wp.array[wp.vec3], weight: float, cut: Cut) -> wp.vec3:
-    """A vertex by its weight towards the middle of its neighbours."""
+    """A vertex, moved by its weight towards the mean of its neighbours."""
     place = points[i]
     start = cut.ring_start[i]
     end = cut.ring_start[i + 1]
@@ -90,14 +90,14 @@ def levelled(i: int, points: wp.array[wp.vec3], weight: float, cut: Cut) -> wp.v
 
 @wp.kernel
 def level_kernel(points: wp.array[wp.vec3], weight: wp.array[float], cut: Cut, leveller: wp.array[wp.vec3]) -> None:
-    """`levelled` of one vertex a thread."""
+    """`levelled`, one vertex a thread."""
     i = wp.tid()
     leveller[i] = levelled(i, points, weight[i], cut)
 
 
 @wp.func
 def widest(i: int, weight: wp.array[float], share: wp.array[float], cut: Cut, fade: float) -> float:
-    """The weight of a vertex, or what is left of the largest of its neighbours', up to its share."""
+    """The weight of a vertex, or `fade` times the largest of its neighbours', up to its share, if that is larger."""
     most = float(0.0)
     for r in range(cut.ring_start[i], cut.ring_start[i + 1]):
         most = wp.max(most, weight[cut.ring[r]])
@@ -108,7 +108,7 @@ def widest(i: int, weight: wp.array[float], share: wp.array[float], cut: Cut, fa
 def widen_kernel(
     weight: wp.array[float], share: wp.array[float], cut: Cut, fade: float, wider: wp.array[float]
 ) -> None:
-    """`widest` of one vertex a thread."""
+    """`widest`, one vertex a thread."""
     i = wp.tid()
     wider[i] = widest(i, weight, share, cut, fade)
 
@@ -122,9 +122,9 @@ def bound_kernel(fold: Fold, most: float) -> None:
 
 @wp.kernel
 def unfold_all_kernel(fold: Fold, fade: float, reach: int, rounds: int, most: float) -> None:
-    """All that follows on `fold_kernel`, by one thread: of those that have folded over, and of who is `reach` around.
+    """All steps after `fold_kernel`, by one thread: for vertices that have folded over and those `reach` edges around.
 
-    `rounds` are even.
+    `rounds` is even.
     """
     for r in range(fold.count[0]):
         fold.is_listed[fold.rows[r]] = 1

@@ -1,4 +1,4 @@
-"""The last step of contact: whoever the winding number finds inside the body leaves it."""
+"""The last step of contact: vertices that the winding number finds inside the body leave it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class WayOut:
     """Takes vertices that are inside a posed body, by winding number, to the closest skin that is outside of it.
 
     Faces with an interior above them are covered by another part of the body, and don't count. As a face may be covered
-    in part, who is inside after that goes to a vertex or to the middle of a face that is known to be open.
-    In most frames nobody is inside, and the winding numbers are all that this costs.
+    in part, a vertex that is still inside then goes to a vertex or face middle of the body that is known to be open.
+    In most frames no vertex is inside, and the winding numbers are the only cost.
     """
 
     def __init__(self, faces: Tensor, body: Tensor, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
@@ -45,10 +45,10 @@ class WayOut:
 
     @torch.no_grad()
     def __call__(self, points: Tensor, around: Tensor, margin: float) -> tuple[Tensor, Tensor]:
-        """The points (N, 3) [m] with nobody inside who has a way out, and how many are inside after all, shape ().
+        """The points (N, 3) [m], those inside taken out where there is a way, and how many are still inside, shape ().
 
-        Who leaves stays `margin` [m] off the skin, or less where that is inside again, and at most `max_displacement`
-        away from `around` (N, 3) [m]. A GPU isn't waited for. Not differentiable.
+        A point that is taken out ends `margin` [m] off the skin, or less where that is inside again, and at most
+        `max_displacement` away from `around` (N, 3) [m]. A GPU isn't waited for. Not differentiable.
         """
         winding = self._winding(points).clone()
         n_inside = torch.count_nonzero(winding)
@@ -72,9 +72,9 @@ class WayOut:
 
     @torch.no_grad()
     def open_skin(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The closest places on open skin (N, 3) [m] of those of the points (N, 3) [m] that are inside, and which are.
+        """The closest places on open skin (N, 3) [m] to those points (N, 3) [m] that are inside, and which points are.
 
-        Who has none within `max_displacement` isn't among them.
+        Points with none within `max_displacement` aren't among them.
         """
         is_inside = self._winding(points) != 0
         foot, normal = self._nearest_skin(points, is_inside, self._winding_above(), of_samples=False)
@@ -90,9 +90,9 @@ class WayOut:
     def _nearest_skin(
         self, points: Tensor, is_inside: Tensor, above: Tensor, *, of_samples: bool
     ) -> tuple[Tensor, Tensor]:
-        """For those of the points that are inside, the closest place on open skin (N, 3) [m], the normal there (N, 3).
+        """For the points that are inside, the closest place on open skin (N, 3) [m], and the normal there (N, 3).
 
-        `above` are the `_winding_above`; with `of_samples` no other place than these samples is taken.
+        `above` is what `_winding_above` says of the samples; with `of_samples` only the samples themselves are taken.
         """
         foot, normal = points.new_zeros(2, len(points), 3)
         points, asked = points.contiguous(), is_inside.int()
@@ -106,4 +106,4 @@ class WayOut:
 
 
 _SHARES = (1.0, 0.0)
-"""Of the margin, tried one after another: in a crease there is less room."""
+"""Shares of the margin, tried one after another: in a crease there is less room."""

@@ -12,7 +12,7 @@ _ROUNDS = wp.constant(4)
 
 @wp.func
 def body_at(sample: int, body: wp.array[wp.vec3], faces: wp.array2d[int]) -> wp.vec3:
-    """A sample of the skin: a vertex, or after those the middle of a face."""
+    """A sample of the skin: the vertices come first, then the middles of faces."""
     f = sample - body.shape[0]
     if f < 0:
         return body[sample]

@@ -1,4 +1,4 @@
-"""Makes one orientable manifold surface of a file's triangles, or says why there is none."""
+"""Makes one orientable manifold surface from a file's triangles, or says why that can't be done."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from refu_core.mesh import Connectivity, linked
 Ints = NDArray[np.int64]
 
 _SAME_PLACE = 1e-5
-"""Vertices nearer than this are one, as a share of the mesh's extent: 10 µm of a dress."""
+"""Vertices closer to each other than this are merged, as a share of the mesh's extent: 10 µm for a dress."""
 _FAR_OFF = 20.0
-"""How many times as far off as nearly all of a mesh what doesn't belong to it is."""
+"""Faces this many times as far out as nearly all of a mesh don't belong to it."""
 MAX_VERTICES = 60_000
-"""Of a garment that is worn: at 10 mm a frame has a tenth of that many."""
+"""Most vertices of a garment that is worn; with edges of 10 mm a garment has about a tenth of that many."""
 
 
 def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
@@ -60,7 +60,7 @@ def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
 
 
 def rim_vertices(f: Ints) -> Ints:
-    """Vertices of edges of one face."""
+    """Vertices of edges that have only one face."""
     return np.unique(Connectivity.of(f).boundary).astype(np.int64)
 
 
@@ -85,7 +85,7 @@ def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
             is_long = np.zeros(len(uv_edges), bool)
             is_long[uv_of_corner[long[of_corner]]] = True
             uv_middle = np.where(is_long, len(uv.coordinates) + np.cumsum(is_long) - 1, -1)
-            # An edge of the texture may be that of two edges of the mesh: split where the face is, and only there.
+            # An edge of the texture may belong to two edges of the mesh: it is split where the face is, and only there.
             corners = np.where(long[of_corner], uv_middle[uv_of_corner], -1)
             coordinates = np.concatenate((uv.coordinates, uv.coordinates[uv_edges[is_long]].mean(1)))
             uv = UvMap(coordinates.astype(np.float32), _split(uv.faces, corners))
@@ -93,7 +93,7 @@ def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
 
 
 def _split(f: Ints, middle: Ints) -> Ints:
-    """Faces (F, 3) whose edges (0, 1), (1, 2), (2, 0) have a vertex in the middle, or -1, as triangles in order."""
+    """Triangles, in order, of faces (F, 3) cut at `middle`: vertices on edges (0, 1), (1, 2), (2, 0), -1 for none."""
     count = (middle >= 0).sum(1)
     parts = [np.empty((0, 5), np.int64)]
     rows = np.arange(len(f))
@@ -116,20 +116,20 @@ def _split(f: Ints, middle: Ints) -> Ints:
     for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
         add(three, *(corner[three] for corner in corners))
     found = np.concatenate(parts)
-    # By face and by part: UVs, which are split apart from the mesh, come out in the same order.
+    # Sorted by face and by part, so that UVs, which are split separately, come out in the same order.
     result: Ints = found[np.lexsort((found[:, 1], found[:, 0])), 2:]
     return result
 
 
 def _edges(f: Ints) -> tuple[Ints, Ints]:
-    """Each edge once (E, 2), and those of the corners (0, 1), (1, 2), (2, 0) of each face (F, 3)."""
+    """Each edge once (E, 2), and the numbers of the edges (0, 1), (1, 2), (2, 0) of each face (F, 3)."""
     pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
     edges, of_corner = np.unique(pairs, axis=0, return_inverse=True)
     return edges, of_corner.reshape(-1, 3)
 
 
 def _without_strays(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
-    """Without faces so far off that the garment would be a speck beside them."""
+    """The mesh without faces so far off that the garment would be a speck beside them."""
     v = mesh.vertices
     low, middle, high = np.percentile(v[mesh.faces].reshape(-1, 3), (2, 50, 98), axis=0)
     reach = _FAR_OFF * float(np.maximum(high - middle, middle - low).max())
@@ -141,8 +141,8 @@ def _without_strays(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
 
 
 def _groups_of_place(v: NDArray[np.float64], extent: float) -> Ints:
-    """The first vertex at the same place as each, shape (V,), in a mesh of some extent."""
-    # Those in a cell as small as a place are one before pairs are looked for: a crowd would make pairs without number.
+    """For each vertex the first one at the same place, shape (V,), in a mesh of some extent."""
+    # Vertices in one tiny cell are merged before pairs are looked for: a crowd would make countless pairs.
     cell = np.floor((v - v.min(0)) / (_SAME_PLACE * extent / np.sqrt(3)))
     _, first, of_cell = np.unique(cell, axis=0, return_index=True, return_inverse=True)
     pairs = cKDTree(v[first]).query_pairs(_SAME_PLACE * extent, output_type="ndarray")
@@ -155,7 +155,7 @@ def _groups_of_place(v: NDArray[np.float64], extent: float) -> Ints:
 def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     extent = float(np.linalg.norm(np.ptp(mesh.compact().vertices, axis=0)))
     n = len(mesh.faces)
-    # First those without area: their corners may all be at one place, and pairs of them without number.
+    # Faces without area go first: their corners may all be at one place, and make countless pairs.
     mesh = _only(mesh, np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1) >= (1e-7 * extent) ** 2)
     place = _groups_of_place(mesh.vertices, extent)[mesh.faces]
     has_area = (place != np.roll(place, 1, 1)).all(1)
@@ -173,7 +173,7 @@ def _only(mesh: SurfaceMesh, kept: NDArray[np.bool_]) -> SurfaceMesh:
 
 
 def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
-    """Vertices of open edges that are at one place become one; sheets that only touch stay apart."""
+    """Merges vertices of open edges that are at one place; sheets that only touch stay apart."""
     on_rim = rim_vertices(mesh.faces)
     target = np.arange(len(mesh.vertices))
     if len(on_rim):
@@ -188,7 +188,7 @@ def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
 def _partners(mesh: SurfaceMesh) -> tuple[Ints, int]:
     """Pairs of corners, 3 f + k for the edge from corner k of face f, across which faces continue; (P, 2).
 
-    And how many edges have more than two faces. Of those the two faces that fold least stay together.
+    Also how many edges have more than two faces. Of these faces, the two that fold least stay together.
     """
     edges, of_corner = _edges(mesh.faces)
     order = np.argsort(of_corner.ravel(), kind="stable")
@@ -214,7 +214,7 @@ def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
     """Which faces have to be turned over for each piece to face one way, as most of its faces do, shape (F,)."""
     start, n = f.ravel()[pairs], len(f)
     agrees = start[:, 0] != start[:, 1]  # the shared edge is run through in opposite directions
-    # Each face is there twice, as it is (k) and turned over (n + k), and tied to what faces the same way beside it.
+    # Each face is there twice, as it is (k) and turned over (n + k), and linked to neighbours that face the same way.
     a, b = (pairs // 3).T
     same, other = np.where(agrees, b, b + n), np.where(agrees, b + n, b)
     _, label = linked(np.concatenate((np.stack((a, same), 1), np.stack((a + n, other), 1))), 2 * n)
@@ -223,7 +223,7 @@ def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
         msg = "the mesh has one side only: following it round (a Möbius strip), inside becomes outside; cut it open"
         raise GarmentError(msg)
     votes = np.bincount(as_is, minlength=label.max() + 1)
-    # Of as many either way, the piece's first face stays: labels count up from the first face on.
+    # On a tie, the piece's first face stays: labels count up from the first face on.
     flipped: NDArray[np.bool_] = (votes[as_is] < votes[turned]) | ((votes[as_is] == votes[turned]) & (as_is > turned))
     if flipped.any():
         notes.append(f"{int(flipped.sum())} faces faced the other way than their neighbours and were turned over")
@@ -231,7 +231,7 @@ def _oriented(f: Ints, pairs: Ints, notes: list[str]) -> NDArray[np.bool_]:
 
 
 def turned_over(mesh: SurfaceMesh, flipped: NDArray[np.bool_]) -> SurfaceMesh:
-    """The mesh with some of its faces seen from the other side; each still begins at its first corner."""
+    """The mesh with the `flipped` faces turned over; each still begins at its first corner."""
 
     def turned(f: Ints) -> Ints:
         return np.where(flipped[:, None], f[:, [0, 2, 1]], f)
@@ -241,18 +241,18 @@ def turned_over(mesh: SurfaceMesh, flipped: NDArray[np.bool_]) -> SurfaceMesh:
 
 
 def _cut_apart(mesh: SurfaceMesh, pairs: Ints) -> SurfaceMesh:
-    """A vertex for each fan of faces that edges hold together."""
+    """The mesh with a vertex for each fan of faces that edges hold together."""
     f = mesh.faces
     n = f.size
     following = np.arange(n).reshape(-1, 3)[:, [1, 2, 0]].ravel()
     one, other = pairs.T
-    # Oriented alike, an edge begins in one face where it ends in the other.
+    # Faces are oriented alike, so an edge begins in one face where it ends in the other.
     links = np.concatenate((np.stack((one, following[other]), 1), np.stack((following[one], other), 1)))
     count, label = linked(links, n)
     vertices = np.empty((count, 3))
     vertices[label] = mesh.vertices[f.ravel()]
     order = np.full(count, n, np.int64)
-    np.minimum.at(order, label, f.ravel())  # as in the file, where nothing was cut
+    np.minimum.at(order, label, f.ravel())  # the file's order, where nothing was cut
     rank = np.empty(count, np.int64)
     rank[np.argsort(order, kind="stable")] = np.arange(count)
     placed = np.empty_like(vertices)

@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 
 HOLDS: tuple[str, ...] = ("waist", "shoulders")
 LONGEST_EDGE = 0.02
-"""Longer edges are split [m]: between their ends the body comes through. Those of the paper's garments are shorter."""
+"""Longer edges are split [m]: the body would come through between their ends. The paper's garments have none."""
 CLEARANCE = 0.005
 """Least distance from the mean body in the T-pose [m]; the styles of the paper's garments keep as much."""
 
@@ -34,31 +34,32 @@ _INFLUENCES = 6
 _SKIN_LENGTH = 0.012
 """Skinning weights are smooth over this length at least [m]; in the paper's garments over 12 rings, 3 cm."""
 _SHAPE_LENGTH = 0.03
-"""As much for what β moves [m]."""
+"""The same for what β moves [m]."""
 _DEEP, _MOST_DEEP = 0.03, 0.04
-"""A garment of which such a share is so deep in the body [m], in the T-pose, was made for another body or pose."""
+"""A garment of which more than a share `_MOST_DEEP` is deeper than `_DEEP` [m] in the body, in the T-pose, was made for
+another body or pose."""
 _FARTHEST, _MOST_FAR = 0.06, 0.003
-"""No more than such a share of the vertices has to move so far [m] to be outside of the body: else a limb went through
-the cloth. The few are between toes or fingers, where there is no room for it."""
+"""If more than a share `_MOST_FAR` of the vertices has to move farther than `_FARTHEST` [m] to be outside the body, a
+limb went through the cloth. A few may have to: between toes or fingers there is no room for cloth."""
 _STRETCHED, _MOST_STRETCHED = 2.0, 0.02
-"""Cloth that is brought into the T-pose has no more than such a share of edges that become so many times as long: of
-sleeves in an A-pose, those under the arms."""
+"""When cloth is brought into the T-pose, at most a share `_MOST_STRETCHED` of its edges should become more than
+`_STRETCHED` times as long; in sleeves from an A-pose, those under the arms do."""
 _FELT = 0.02
-"""A joint is felt where it has this share at some vertex."""
+"""A garment depends on a joint that has more than this skinning weight at some vertex."""
 _SHOULDERS = tuple(
     JOINT_NAMES.index(name)
     for name in ("head", "neck", "left_collar", "right_collar", "left_shoulder", "right_shoulder")
 )
 _ROUNDS = 20
 _MOST_PIECES = 1000
-"""A coat has some dozens with its buttons; triangles that nearly touch are thousands, and take minutes."""
+"""A coat with its buttons has some dozens; loose triangles that nearly touch are thousands, and take minutes."""
 _FLAT = 0.99
-"""So much of a mesh faces along one line only where it is laid out flat; a garment has two thirds at most."""
+"""A mesh is laid out flat if more than this share of it faces along one line; a garment has two thirds at most."""
 
 
 @dataclass(frozen=True)
 class GarmentDetails:
-    """What a mesh doesn't say of a garment; None for what follows from its place on the body."""
+    """What a mesh doesn't say about a garment; None for what follows from its place on the body."""
 
     layer: int = 1
     color: tuple[float, float, float] = (0.55, 0.52, 0.62)
@@ -74,9 +75,9 @@ class FittedGarment:
 
     template: GarmentTemplate
     notes: list[str] = field(default_factory=list)
-    """What was found out about the mesh, and changed in it, a sentence each."""
+    """What was found out about the mesh and changed in it, one sentence each."""
     warnings: list[str] = field(default_factory=list)
-    """Why it may not be worn as it was meant, a sentence each; empty where nothing says so."""
+    """Reasons why it may not be worn as it was meant, one sentence each; empty if there are none."""
 
 
 def fit_garment(
@@ -88,14 +89,14 @@ def fit_garment(
     details: GarmentDetails | None = None,
     longest_edge: float = LONGEST_EDGE,
 ) -> FittedGarment:
-    """Makes a garment of a mesh that was made for about this body: it can be worn at once, without networks.
+    """Makes a garment from a mesh that was made for roughly this body: it can be worn at once, without networks.
 
     Args:
         mesh: as `read_surface` reads it.
         body: one of the built-in bodies, on the CPU.
-        name: what the garment shall be called.
-        placing: what is known of the mesh's unit, axes, place and pose; by default all of it is found out.
-        details: what is known of the garment besides.
+        name: the garment's name.
+        placing: what is known about the mesh's unit, axes, place and pose; by default all of it is found out.
+        details: what else is known about the garment.
         longest_edge: longer edges are split [m].
 
     Raises:
@@ -129,15 +130,15 @@ def fit_garment(
             continue
         if worn.moved <= _FARTHEST:
             return _bound(worn, body, name, details, notes)
-        if not faults and makeshift is None:  # what can't be where it belongs is no better off elsewhere
+        if not faults and makeshift is None:  # a mesh that can't be where it belongs is no better elsewhere
             makeshift = worn
     if makeshift is None:
-        raise faults[0]  # there is a place, or `find_places` has said that there is none
+        raise faults[0]  # `find_places` finds a place, or raises
     return _bound(makeshift, body, name, details, notes)
 
 
 def _require_worn(mesh: SurfaceMesh) -> None:
-    """Raises `GarmentError` for what lies flat, and for what is no cloth but shreds."""
+    """Raises `GarmentError` for a mesh that is laid out flat, or that is in shreds."""
     n_pieces, _ = components(mesh.faces, len(mesh.vertices))
     if n_pieces > _MOST_PIECES:
         msg = f"it is in {n_pieces} pieces, at most {_MOST_PIECES} are worn: merge the vertices that lie on each other"
@@ -157,7 +158,7 @@ class _Worn(NamedTuple):
     notes: list[str]
     warnings: list[str]
     moved: float
-    """How far vertices had to move to be outside of the body [m]."""
+    """The farthest that a vertex had to move to be outside of the body [m]."""
 
 
 def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float) -> _Worn:
@@ -188,7 +189,7 @@ def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
 
 
 def stretch(faces: Ints, before: F64, after: F64) -> F64:
-    """How many times as long each edge is as it was, shape (E,)."""
+    """How many times its former length each edge has, shape (E,)."""
     a, b = Connectivity.of(faces, len(before)).edges.T
     was, now = (np.linalg.norm(v[a] - v[b], axis=1) for v in (before, after))
     found: F64 = now / np.maximum(was, 1e-9)
@@ -196,7 +197,7 @@ def stretch(faces: Ints, before: F64, after: F64) -> F64:
 
 
 def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:
-    """The garment of a mesh that is on the body: what it follows, and what is known of it."""
+    """Makes the garment from a mesh that is on the body: what it follows, and what is known about it."""
     mesh, notes = worn.mesh, notes + worn.notes
     vertices, posed = mesh.vertices, PosedBody(body, np.zeros((N_JOINTS, 3)))
     transfer = Transfer.of(vertices, mesh.faces, posed)
@@ -230,14 +231,14 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
 
 
 def _shapedirs(body: SmplBody) -> F64:
-    """Displacement a unit of each beta of the body's vertices [m], shape (N, 30)."""
+    """Displacements of the body's vertices per unit of each beta [m], shape (N, 30)."""
     shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template
     found: F64 = shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
     return found
 
 
 def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
-    """With faces that are counter-clockwise from outside: away from the body, or out of a closed piece."""
+    """The mesh with faces counter-clockwise from outside: they face away from the body, or out of a closed piece."""
     v, f = mesh.vertices, mesh.faces
     _, label = components(f, len(v))
     piece = label[f[:, 0]]
@@ -245,7 +246,7 @@ def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
     normals = face_normals(v, f)
     centres = v[f].mean(1)
     distance, gradient = body(centres)
-    # Cloth near the skin says more: of a wide hem either side may be nearer to a leg.
+    # Cloth near the skin says more: on a wide hem, either side may face the nearest leg.
     from_body = (normals * gradient).sum(1) / (0.02 + np.abs(distance))
     from_middle = (normals * (centres - v.mean(0))).sum(1)
     side = np.bincount(piece, np.where(is_open, from_body, from_middle))
@@ -263,7 +264,7 @@ def _unposed(mesh: SurfaceMesh, posed: PosedBody) -> F64:
 
 
 def _few(weights: F64) -> F64:
-    """At most six joints a vertex, none of them for next to nothing."""
+    """The weights of at most six joints per vertex, without negligible ones."""
     kept = weights.clip(0).copy()
     np.put_along_axis(kept, np.argsort(-kept, axis=1)[:, _INFLUENCES:], 0.0, axis=1)
     kept[kept < 2e-3] = 0.0
@@ -272,7 +273,7 @@ def _few(weights: F64) -> F64:
 
 
 def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
-    """Vertices off the mean body by `CLEARANCE`, middles of edges too; their neighbours give way by less."""
+    """Vertices brought `CLEARANCE` off the mean body, middles of edges too; their neighbours move by less."""
     connectivity = Connectivity.of(mesh.faces, len(mesh.vertices))
     edges = connectivity.edges
     adjacent = connectivity.adjacency_matrix()

@@ -23,14 +23,14 @@ _MAX_FACES = 400_000
 _MAX_CORNERS = 1000
 """Of one polygon: the lid of a fine tube has hundreds."""
 _SIZES = (1e-6, 1e9)
-"""The largest extent of a mesh in any unit: of a garment 1e-4 in kilometres, 1e6 in micrometres."""
+"""Limits of a mesh's extent in its own unit: a garment may have 1e-4 in kilometres, 1e6 in micrometres."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMesh:
     """Triangles as a file has them: in any unit and axes, perhaps cut open along the seams of its UVs.
 
-    Raises `GarmentError` for arrays of another kind, no faces, and faces of vertices that there aren't.
+    Raises `GarmentError` for arrays of another kind, for no faces, and for faces with vertices that don't exist.
     """
 
     vertices: NDArray[np.float64]
@@ -54,7 +54,7 @@ class SurfaceMesh:
         return SurfaceMesh(self.vertices, self.faces[kept], uv)
 
     def compact(self, faces: NDArray[np.int64] | None = None) -> SurfaceMesh:
-        """The mesh without vertices that no face uses; with `faces` (F, 3) of its vertices, those if given."""
+        """The mesh without vertices that no face uses; if given, `faces` (F, 3) take the place of its own."""
         used, local = np.unique(self.faces if faces is None else faces, return_inverse=True)
         return replace(self, vertices=self.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
 
@@ -74,12 +74,12 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
         if suffix == ".gltf" and b'"uri"' in content and b'"data:' not in content:
             msg = "its numbers are in a file beside it; save it as one file, .glb"
             raise ValueError(msg)
-        with np.errstate(all="ignore"):  # of what isn't finite; it is asked for below
+        with np.errstate(all="ignore"):  # numbers that aren't finite are refused below
             mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
         _require_few(len(mesh.faces))
     except ImportError:
         raise
-    except Exception as error:  # trimesh raises whatever a damaged file makes of it
+    except Exception as error:  # trimesh may raise anything for a damaged file
         msg = f"{source}: not a mesh that can be read: {error or type(error).__name__}"
         raise GarmentError(msg) from error
     return mesh
@@ -156,13 +156,13 @@ def _corner(word: str, n_vertices: int, n_coordinates: int) -> tuple[int, int]:
 
 
 def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Polygons as triangles, in order, (T, 3, 2): quads are cut along the shorter diagonal, others by their ears."""
+    """Polygons as triangles, in order, (T, 3, 2): quads are cut along the shorter diagonal, others by ears."""
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     if len(sizes) and sizes.max() > _MAX_CORNERS:
         msg = f"a polygon of {sizes.max()} corners, at most {_MAX_CORNERS} are read: triangulate it"
         raise ValueError(msg)
     known = np.array([max((corner[0] for corner in polygon), default=0) < len(points) for polygon in polygons], bool)
-    # Of which polygon, and its corners.
+    # For each triangle, the number of its polygon, and its corners.
     found = [(np.flatnonzero(sizes == 3), np.array([p for p in polygons if len(p) == 3], np.int64).reshape(-1, 3, 2))]
     rows = np.flatnonzero((sizes == 4) & known)
     quads = np.array([polygons[row] for row in rows], dtype=np.int64).reshape(-1, 4, 2)
@@ -171,7 +171,7 @@ def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64
     found += [(rows[is_convex], quads[which, cuts[:, k]][is_convex]) for k in range(2)]
     for row in (*rows[~is_convex], *np.flatnonzero((sizes > 4) | ((sizes == 4) & ~known))):
         polygon = np.array(polygons[row], dtype=np.int64)
-        # Whose vertices aren't there is refused below.
+        # A polygon whose vertices don't exist is refused later.
         ears = _ears(points[polygon[:, 0]]) if known[row] else [(0, k, k + 1) for k in range(1, len(polygon) - 1)]
         found += [(np.array([row]), polygon[list(ear)][None]) for ear in ears]
     order = np.argsort(np.concatenate([row for row, _ in found]), kind="stable")
@@ -190,7 +190,7 @@ def _cut_quads(places: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[
 
 
 def _ears(places: NDArray[np.float64]) -> Iterable[tuple[int, int, int]]:
-    """Triangles of a polygon (N, 3) that needn't be convex: corners that hold no other one, shortest cut first."""
+    """Triangles of a polygon (N, 3), convex or not: cuts off corners that hold no other one, shortest cut first."""
     normal = np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0)
     left = list(range(len(places)))
     while len(left) > 3:

@@ -1,4 +1,4 @@
-"""Pieces of a mesh that aren't one garment: its wearer, panels that nobody has sewn, clothes worn together."""
+"""Pieces of a mesh that aren't one garment: its wearer, panels that aren't sewn, clothes worn together."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Ints = NDArray[np.int64]
 
 _ENDS = tuple(JOINT_NAMES.index(name) for name in ("head", "left_hand", "right_hand", "left_foot", "right_foot"))
 _ON_SKIN = 0.02
-"""Half of a body lies nearer than this to another one's skin [m]; of an overall with hood and gloves it doesn't."""
+"""At least half of a body lies nearer than this to the skin [m]; of an overall with hood and gloves, less does."""
 _SEAM = 0.01
-"""Rims of two pieces that are nearer to each other than this were meant to be sewn [m]: panels are laid out so."""
+"""Rims of two pieces nearer to each other than this were meant to be sewn [m]: panels are laid out that way."""
 _SHARE = 0.1
-"""Of a piece's rim that has to be so near to another one's."""
+"""Least share of a piece's rim that has to be that near to another piece's rim."""
 _LARGE = 0.05
-"""Share of a mesh's area that a garment of several has at least."""
+"""Least share of a mesh's area that each of several garments in it has."""
 _BETWEEN = 0.02
-"""So far apart [m] along the body there are two garments."""
+"""Parts farther than this from each other [m] along the body are two garments."""
 
 
 def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, list[str]]:
@@ -72,10 +72,10 @@ def unsewn(mesh: SurfaceMesh) -> list[str]:
 
 
 def _gaps(points: F64, label: Ints) -> F64:
-    """How far each point is from the next one of another label [m], infinity where that is `_SEAM` or more."""
+    """How far each point is from the nearest one with another label [m], infinity if that is `_SEAM` or more."""
     tree, labels = cKDTree(points), np.append(label, -1)
     gap, left, k = np.full(len(points), np.inf), np.arange(len(points)), 4
-    while len(left):  # of those that have seen none but their own within reach
+    while len(left):  # points that have seen only their own label, with more in reach
         distance, other = tree.query(points[left], k=k, distance_upper_bound=_SEAM)
         is_there = np.isfinite(distance)
         of_others = is_there & (labels[other] != label[left, None])

@@ -34,39 +34,39 @@ _N_POINTS = 400
 _TOLERANCE = 0.015
 """A mesh is taken as it is unless something else fits this much better, as a share of its size."""
 _UNIT_TOLERANCE = 0.005
-"""What had to be moved is worn in no other size that fits less than this better, likewise."""
+"""A mesh that had to be moved keeps a known unit unless another size fits this much better, likewise."""
 _MISFIT = 2.0
-"""In a known unit it is believed, if it fits, unless another size fits this many times as well: whatever is loose would
-fit better if it were smaller."""
+"""A mesh that fits in a known unit has that unit, unless another size fits this many times as well: loose cloth would
+always fit better if it were smaller."""
 _POSE_TOLERANCE = 0.002
-"""It is taken to be in the T-pose unless another pose fits this much better, likewise."""
+"""A mesh is taken to be in the T-pose unless another pose fits this much better, likewise."""
 _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 """Largest extents that a mesh of no known unit is tried with [m]."""
 _NOTHING = 0.01
-"""What fits has less than this share of it inside the body."""
+"""A mesh that fits has less than this share of it inside the body."""
 _N_REFINED = 2
 _ASKEW = np.radians(10)
-"""A garment's breadth lies along an axis as nearly as that, or it stands askew."""
+"""A garment stands askew if its breadth is turned farther than this from an axis [rad]."""
 _BROADER = 1.7
-"""How much larger the variance along its breadth is than that along its depth, for these to show."""
+"""A garment's breadth shows only if the variance along it is more than this many times that along its depth."""
 _OF_NO_UNIT = 1e-3
-"""An extent that is so near to 1, or 2, was made so, as data sets of shapes are: it says nothing of a unit."""
+"""An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit."""
 
 
 @dataclass(frozen=True)
 class Placing:
-    """What is known of a mesh; None for what is to be found out."""
+    """What is known about a mesh; None for what is to be found out."""
 
     unit: float | None = None
     """Metres of the mesh's unit."""
     up: str | None = None
     """`y` or `z`."""
     pose: F64 | None = None
-    """That the mesh was modelled in: rotation vectors [rad], shape (24, 3); zeros for the T-pose."""
+    """The pose that the mesh was modelled in: rotation vectors [rad], shape (24, 3); zeros for the T-pose."""
     is_placed: bool = False
     """Whether the mesh's origin is the body's; otherwise it may be moved."""
     held_at: str | None = None
-    """What is held at the `waist` doesn't reach up between the arms."""
+    """A garment that is held at the `waist` doesn't reach up between the arms."""
 
     def __post_init__(self) -> None:
         """Raises `GarmentError` for what is no unit, no axis or no pose."""
@@ -95,11 +95,11 @@ class Place:
     top: float
     """How high the mesh reaches [m]."""
     kind: str
-    """How it came there: as it is (empty), from a `floor`, or `searched`."""
+    """How it was placed: as it is (empty), moved from a `floor`, or `searched`."""
     notes: list[str] = field(default_factory=list)
 
     def is_like(self, other: Place) -> bool:
-        """Whether it has the same unit and axes, and came there likewise."""
+        """Whether it has the same unit and axes, and was placed in the same way."""
         is_as_large = (self.unit, self.kind) == (other.unit, other.kind)
         return is_as_large and bool(np.array_equal(self.turn, other.turn))
 
@@ -109,9 +109,9 @@ class Place:
         return _is_sideways(self.turn)
 
     def cost(self, extent: float) -> float:
-        """As a share of the garment's size, or the smallest one would always be the nearest to the skin.
+        """The cost as a share of the garment's size; otherwise the smallest size would always be nearest to the skin.
 
-        What nobody would do without need counts, too: to model a garment sideways, with spread legs or hanging arms.
+        What nobody does without need counts, too: modelling a garment sideways, with spread legs or hanging arms.
         """
         arms, legs = self.pose[RIGHT_SHOULDER, 2], self.pose[LEFT_HIP, 2]
         without_need = 0.02 * self.is_sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
@@ -127,14 +127,14 @@ NO_OPENING = ". It has no opening: if faces close its neck, sleeves, legs or hem
 _UNDER_ARMS = 0.1
 """How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
 _HAT = 0.3
-"""How far above the body cloth reaches at most [m]: a tube that stood on the head was taken for wide."""
+"""How far above the body cloth reaches at most [m]; without this, a tube on the head was taken for wide cloth."""
 
 
 def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator[Place]:
-    """Where a mesh may belong on a body of mean shape, the likeliest first; what isn't asked for isn't searched.
+    """Where a mesh may belong on a body of mean shape, the likeliest first; places are only searched when asked for.
 
-    As it is, if it surrounds the body like that, or in another unit, with another axis up, standing on the floor, in an
-    A-pose. Else it is moved until it does; and if that doesn't help, scaled by what is no unit.
+    The mesh stays as it is if it surrounds the body like that, or in another unit, with another axis up, standing on
+    the floor, or in an A-pose. Else it is moved until it does; if that fails, it is scaled by a factor that is no unit.
 
     Raises `GarmentError`: in no unit is it as large as a garment, or it surrounds the body nowhere.
     """
@@ -157,7 +157,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     good = [one for one in found if one.fit.is_plain]
     if good:
         least = min(one.cost(extent) for one in good)
-        chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # what says least is asked first
+        chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # plain assumptions come first
         if placing.pose is None:
             likes = sorted((one for one in found if one.is_like(chosen)), key=lambda one: one.cost(extent))
             refined = [search.refined(one, moves=False, scales=False) for one in likes[:2]]
@@ -166,17 +166,17 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
                 yield _told(other)  # and if a limb goes through it there:
         yield _told(chosen)
     rings = [one for one in found if one.fit.is_ring and not one.kind and not one.is_sideways]
-    if rings and not good:  # what is around the body where it was modelled isn't looked for elsewhere
+    if rings and not good:  # a mesh around the body where it was modelled isn't searched elsewhere
         yield _told(rings[0])
     found.sort(key=lambda one: (not one.fit.is_good, one.cost(extent)))
     tiers = found[:1]
     for one in tiers:
         if one.fit.is_good and one.fit.inside < _NOTHING and one.fit.distance < NEAR and not one.is_sideways:
-            yield _told(one)  # of gloves much faces other fingers
+            yield _told(one)  # much of a glove faces other fingers
     for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
         if not placing.is_placed:
             tiers += search.along(bodies, turns, tried or units, scales=tried is not None)
-    # What was modelled by convention, or else in a known unit, unless it fits much worse.
+    # A place by convention, or else one in a known unit, comes first unless it fits much worse.
     has_unit = abs(np.log2(extent) - round(np.log2(extent))) > _OF_NO_UNIT
     least = min((one.cost(extent) for one in tiers if one.fit.is_good and search.knows(one)), default=math.inf)
     if has_unit:
@@ -189,16 +189,16 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     order = [tiers[k] for k in ranked if tiers[k].fit.is_good]
     tight = [one for one in found if one.fit.is_tight and not one.fit.is_good and not one.is_sideways]
     if tight and not good and has_unit:
-        # A sleeve that no arm is in costs less and faces the wrong way.
+        # A sleeve without an arm in it costs less, but faces the wrong way.
         best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.fit.facing))
-        # Who models in metres and close to the skin means no garment that is a sixth larger, and none that lies.
+        # A mesh in metres that is close to the skin isn't meant to be a sixth larger, or to lie.
         first = [one for one in order if search.knows(one) and np.array_equal(one.turn, best.turn)]
         order = [*first, best, *(one for one in order if one not in first)]
     for one in order:
         yield _told(one)
     lying = [] if placing.up or placing.is_placed else search.along(bodies, _LYING, units, scales=False)
     least = min((one.cost(extent) for one in (*good, *order)), default=math.inf)
-    # Nobody wears it on a hand, or upside down, that could wear it upright.
+    # Nobody wears a garment on a hand, or upside down, that can be worn upright.
     lying = [one for one in lying if one.fit.is_plain and _MISFIT * one.cost(extent) < least]
     for one in lying:
         yield _told(one)
@@ -237,10 +237,10 @@ class _Search:
         return bool(np.isclose(place.unit, self._units).any())
 
     def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
-        """The best of all heights along the body, moved on from there; none of no heights."""
+        """The best place at any height along the body, refined from there; none if there are no heights."""
         few = Samples(*(array[::4] for array in self.samples))  # type: ignore[arg-type]
         few = few._replace(area=4 * few.area)
-        if scales:  # there is much to try: what nobody does isn't
+        if scales:  # there is much to try, so what nobody does is left out
             bodies, turns = bodies[:3], [turn for turn in turns if not _is_sideways(turn)]
         found = [
             one
@@ -253,7 +253,7 @@ class _Search:
         return sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
 
     def refined(self, start: Place, *, moves: bool, scales: bool) -> Place:
-        """The best place near one, by a simplex over pose, and place and size if wanted."""
+        """The best place near `start`, by a simplex search over the pose, and over place and size if wanted."""
         body, samples, turn = PosedBody(self._body, start.pose), self.samples, start.turn
         is_posed = self._placing.pose is not None
         has_legs = parts_legs(start(self._mesh.vertices), self._mesh.faces, self._body)
@@ -272,7 +272,7 @@ class _Search:
                 body.move(standing_pose(float(np.clip(lowered, -0.2, 1.3)), float(np.clip(spread, 0.0, 0.35))))
             unit = min(start.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
             moved = start.shift + np.array(shift) + (start.unit - unit) * middle  # the middle stays as the size changes
-            if start.kind == "floor":  # which is where the feet of this pose are
+            if start.kind == "floor":  # the floor is where the feet of this pose are
                 moved[1] += float(body.vertices[:, 1].min()) - floor
             return _at(samples, unit, turn, moved, body, start.kind)
 
@@ -295,7 +295,7 @@ def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody, k
 
 
 def _turns(up: str | None, mesh: SurfaceMesh, *, is_placed: bool) -> list[F64]:
-    """Rotations that may bring a mesh upright and to face z; the likeliest first. One that is placed faces z."""
+    """Rotations that may bring a mesh upright and to face z; the likeliest first. A placed mesh faces z."""
     z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
     if is_placed:
@@ -320,7 +320,7 @@ _LYING = [
         [[-1, 0, 0], [0, 0, -1], [0, -1, 0]],
     )
 ]
-"""Rotations that may bring a mesh upright that lies on its side, x up or down, or stands on its head."""
+"""Rotations that may set upright a mesh that lies on its side, x up or down, or stands on its head."""
 
 
 def _skew(mesh: SurfaceMesh, base: F64) -> float:
@@ -362,7 +362,7 @@ def _heights(vertices: F64, body: PosedBody) -> list[F64]:
 
 
 def _told(place: Place) -> Place:
-    """With what was found out, in words."""
+    """The place with what was found out, in words."""
     notes = []
     name = next((name for name, unit in UNITS.items() if np.isclose(unit, place.unit)), None)
     if name != "m":

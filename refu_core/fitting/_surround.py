@@ -16,21 +16,21 @@ from refu_core.fitting._posed import PosedBody
 F64 = NDArray[np.float64]
 
 NEAR = 0.06
-"""What is less far off on average lies on the skin, like a glove [m]; what is worn farther off is wide."""
+"""Cloth nearer than this on average lies on the skin, like a glove [m]; cloth that is worn farther off is wide."""
 _WIDE = 0.2
-"""What is wide has skin of this share of its own area within: a crinoline .25, a cape .34, a gown .45, a shirt on the
-hand it hangs on .19."""
+"""Wide cloth encloses skin of at least this share of its own area: a crinoline .25, a cape .34, a gown .45. A shirt
+that hangs on a hand has .19."""
 _FACES, _WIDE_FACES, _PLAINLY_FACES = 0.85, 0.9, 0.93
-"""Share that faces outward: of a glove, between whose fingers much doesn't; of what is wide, by chance 0.89; of what
-leaves no doubt."""
+"""Least share that faces outward: for a glove, between whose fingers much doesn't; for wide cloth, which may have 0.89
+by chance; for cloth that leaves no doubt."""
 _RING_FACES = 0.99
-"""Share of a ring that faces outward: a band 8 cm high and 8 cm off the hips 1.00."""
+"""Least share of a ring that faces outward: a band 8 cm high and 8 cm off the hips has 1.00."""
 _N_SKIN = 600
-"""Vertices of the skin that are asked for that."""
+"""About how many vertices of the skin are checked for being within cloth."""
 _DOWN = np.array([0.3, 0.6, 0.9])
-"""Where thighs and shins are asked whether cloth is between them, from one joint to the next."""
+"""Where thighs and shins are checked for cloth between them, as shares of the way from one joint to the next."""
 _ACROSS = 0.5
-"""Cosine of an angle to the way off the skin from which on cloth lies across it."""
+"""Least cosine between the normal of cloth that lies along the skin and the way off the skin."""
 
 
 class Fit(NamedTuple):
@@ -39,13 +39,13 @@ class Fit(NamedTuple):
     inside: float
     """Share of the surface deeper than 1 cm in the body."""
     depth: float
-    """Mean of what it lacks of 1 cm off the skin, at most 5 cm: what is worn neither touches nor is far off."""
+    """Mean of how much it lacks to be 1 cm off the skin, at most 5 cm: worn cloth neither touches nor is far off."""
     distance: float
     """Mean distance outside, at most 60 cm."""
     facing: float
-    """Share of it that faces away from the body; half of what stands beside it does not."""
+    """Share of it that faces away from the body; half of a mesh that stands beside the body does not."""
     around: float
-    """Area of the skin that it surrounds, as a share of its own; none where it stands beside the body."""
+    """Area of the skin that it surrounds, as a share of its own; zero if it stands beside the body."""
 
     @property
     def cost(self) -> float:
@@ -54,7 +54,7 @@ class Fit(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether it may be worn like that. Garments that were made for a body have 0.00–0.05, < 0.08 and > 0.93.
+        """Whether it may be worn like that. Garments made for a body are 0.00–0.05 inside, < 0.08 off, > 0.93 facing.
 
         A gown or a poncho is far off, but has much of the body in it: a shirt that hangs on a hand has not.
         """
@@ -81,18 +81,18 @@ class Fit(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Points all over a mesh, as many a square metre."""
+    """Points spread evenly over a mesh, by area."""
 
     points: F64
     """In the mesh's own unit and axes, shape (P, 3)."""
     normals: F64
     """Unit, shape (P, 3)."""
     is_open: NDArray[np.bool_]
-    """Whether of a piece with a rim; a closed one is cloth with both its sides, shape (P,)."""
+    """Whether it is on a piece with a rim; a closed piece is cloth with both its sides, shape (P,)."""
     piece: NDArray[np.int64]
-    """Of which piece, shape (P,)."""
+    """The piece that it is on, shape (P,)."""
     area: F64
-    """Of the surface that each stands for, shape (P,)."""
+    """Area of the surface that each point stands for, shape (P,)."""
 
 
 def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
@@ -118,8 +118,8 @@ def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
     """How well samples that are at `points` [m] surround the body; `samples.normals` in the same axes."""
     distance, gradient = body(points)
     outward = (samples.normals * gradient).sum(1)
-    # An open piece faces one way or the other: what is asked is whether all of it does. One side of a closed one faces
-    # the body, the other one away from it, and little of it anything else.
+    # An open piece may face either way, but all of it should face the same way. A closed one has one side that faces
+    # the body and one that faces away from it, and little that faces anything else.
     votes = np.zeros((2, samples.piece.max() + 1))
     np.add.at(votes[0], samples.piece[samples.is_open], outward[samples.is_open] > 0)
     np.add.at(votes[1], samples.piece[samples.is_open], outward[samples.is_open] <= 0)
@@ -133,12 +133,12 @@ def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
 
 
 def _around(points: F64, samples: Samples, is_outer: NDArray[np.bool_], body: PosedBody) -> float:
-    """Area of the skin whose winding number about the samples is above 0.4, as a share of theirs.
+    """Area of the skin where the samples' winding number is above 0.4, as a share of the samples' area.
 
-    Of a piece with two sides the inner one isn't counted: the two would cancel.
+    The inner side of a piece with two sides isn't counted: the two would cancel.
     """
     counts = samples.is_open | is_outer
-    # A share of skin in whole vertices hangs on no seventh digit, and single precision takes half the time.
+    # A share of skin in whole vertices doesn't depend on a seventh digit, and single precision takes half the time.
     places, normals, area = (array[counts].astype(np.float32) for array in (points, samples.normals, samples.area))
     each = max(1, len(body.vertices) // _N_SKIN)
     skin = body.vertices.numpy()[::each]
@@ -151,7 +151,7 @@ def _around(points: F64, samples: Samples, is_outer: NDArray[np.bool_], body: Po
 
 
 def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
-    """Whether cloth of vertices (V, 3) [m] goes through between the legs of a body: a skirt says nothing of them."""
+    """Whether cloth of vertices (V, 3) [m] passes between the legs of a body; a skirt says nothing about them."""
     joints = body.joint_template.double().numpy()
     left, right = (
         np.concatenate([joints[a] + _DOWN[:, None] * (joints[b] - joints[a]) for a, b in pairwise(leg)])
@@ -161,7 +161,7 @@ def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
     u, v = u - corner, v - corner
     normal = np.cross(u, v)
     for start, way in zip(left, right - left, strict=True):
-        # Möller and Trumbore 1997: where the way from leg to leg meets each triangle's plane, and whether in it.
+        # Möller and Trumbore 1997: where the way from leg to leg meets each triangle's plane, and if inside it.
         steep = -(normal @ way)
         steep = np.where(np.abs(steep) < 1e-15, np.inf, steep)
         off = start - corner

@@ -1,8 +1,8 @@
-"""What a body's skin knows (skinning weights, shape directions) on a garment round it.
+"""Carries what a body's skin knows (skinning weights, shape directions) over to a garment around it.
 
 After Abdrashitov, Raichstat, Monsen and Hill, *Robust Skin Weights Transfer via Weight Inpainting* (SIGGRAPH Asia 2023
 Technical Communications): where the closest skin is near and faces the way the cloth does, its values are trusted; from
-there they spread over the cloth. Here both are one equation. Trusted values count the more the nearer they are:
+there they spread over the cloth. Here both steps are one equation. Trusted values count more the nearer they are:
 
     minimise  Σ mᵢ/ℓᵢ² ‖xᵢ - yᵢ‖² (trusted i) + xᵀ L x,    ℓᵢ = ℓ + dᵢ
 
@@ -29,15 +29,15 @@ from refu_core.mesh import vertex_areas, vertex_normals
 F64 = NDArray[np.float64]
 
 _FARTHEST = 0.15
-"""Skin farther off says nothing [m]."""
+"""Skin farther off than this isn't trusted [m]."""
 _FACING = 0.7
 """Least cosine between the cloth's normal and the way off the skin: 45°."""
 _SEAM = 0.01
 """Rims of two pieces this near are sewn together [m]."""
 _RIGID = 0.06
-"""A piece no larger than this beside larger ones doesn't bend: a button, a buckle [m]."""
+"""A piece no larger than this [m], beside larger ones, doesn't bend: a button, a buckle."""
 _LEAST_TRUST = 1e-6
-"""Of every vertex, so that the equation has one solution."""
+"""Trust in every other vertex, so that the equation has a unique solution."""
 _OF_ITS_OWN = 0.05
 """A mesh, or a piece of one, of which less than this share is trusted has no skin of its own."""
 
@@ -87,13 +87,13 @@ class Transfer:
         return cls(face, barycentric, distance, is_trusted, body_faces, vertex_areas(vertices, faces), laplacian, rigid)
 
     def __call__(self, values: F64, *, length: float) -> F64:
-        """Values of the body's vertices, shape (N, K), on the garment's, (V, K), smooth over `length` [m] at least."""
+        """Values at the body's vertices (N, K), carried to the garment's (V, K), smooth over at least `length` [m]."""
         corners = values[self.body_faces[self.face]]
         there = (self.barycentric[:, :, None] * corners).sum(1)
         reach = length + np.abs(self.distance)
         trust = np.where(self.is_trusted, 1.0, _LEAST_TRUST) * np.maximum(self.mass, 1e-12) / reach**2
         matrix = csc_array(self.laplacian + diags_array(trust))
-        # What only few joints have is solved for those alone.
+        # Columns without any value, as of joints far away, needn't be solved for.
         some = np.flatnonzero(there.any(0))
         found = np.zeros((len(there), values.shape[1]))
         if len(some):
@@ -127,7 +127,7 @@ def _laplacian(v: F64, f: NDArray[np.int64], seams: NDArray[np.int64]) -> csc_ar
 
 
 def _seams(v: F64, label: NDArray[np.int64], rim: NDArray[np.int64], is_led: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Pairs of vertices that move together: rims of two pieces that touch, and each piece that is led with the nearest.
+    """Pairs of vertices that move together: touching rims of two pieces, and each piece that is led with the nearest.
 
     Pieces with skin of their own aren't tied to each other: two gloves follow two hands.
     """

@@ -1,4 +1,4 @@
-"""The skin below a garment: where it gives way, the cloth on it goes along."""
+"""The skin below a garment: where it gives way, the cloth on it moves along."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from refu_core.garments._below_kernels import N_BELOW, Vertices, Weights, follow
 from refu_core.garments._template import GarmentTemplate
 
 _WIDTH = 0.01
-"""How much farther than a part's nearest vertex others of it may be to count for much [m]: the length of a body's
-shorter edges."""
+"""How much farther than a part's nearest vertex its other vertices may be and still count much [m]: the length of a
+body's shorter edges."""
 _PARTS = (joints_of("trunk", "head") + ARMS[0] + ARMS[1], *LEGS)
-"""A skirt hangs from both legs, however near one of them is: cloth between them goes half way with either."""
+"""A skirt follows both legs, however near one of them is: cloth between them moves half way with each."""
 
 
 @dataclass(frozen=True, eq=False)
 class SkinBelow:
-    """What of the skin each vertex of a garment lies on.
+    """The skin that each vertex of a garment lies on.
 
-    A collider pulls limbs apart that run through each other: a flank gives way to an arm by centimetres. Cloth that was
-    predicted for the skin would be left behind in the middle of the arm, where the way out of one vertex is in front
-    and that of the next one behind. So it moves as the skin below it does, before it is brought off anything.
+    A collider pulls apart limbs that run through each other: a flank gives way to an arm by centimetres. Cloth that was
+    predicted for the skin would be left behind in the middle of the arm, where one vertex's way out is in front and the
+    next one's is behind. So the cloth first moves with the skin below it, before collisions are resolved.
     """
 
     vertex: Tensor
@@ -48,7 +48,7 @@ class SkinBelow:
             distance, nearest = cKDTree(skin[own]).query(cloth, N_BELOW)
             square.append(torch.from_numpy(distance**2))
             vertex.append(torch.from_numpy(own[nearest]))
-        # A part counts by how much farther it is than the nearest one, for how far off that is.
+        # A part counts by its squared distance relative to that of the nearest part.
         nearest_of = torch.stack([one[:, 0] for one in square], 1)
         height = nearest_of.amin(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
         by_part = (-2 * nearest_of / height).log_softmax(1)
@@ -58,7 +58,7 @@ class SkinBelow:
         return cls(torch.cat(vertex, 1).gather(1, which).int().to(body.device), best.softmax(1).to(body.v_template))
 
     def __call__(self, shift: Tensor) -> Tensor:
-        """How far cloth goes along [m], shape (B, N, 3), with skin that moves by `shift` (B, V, 3). Differentiable."""
+        """How far cloth moves [m], shape (B, N, 3), with skin that moves by `shift` (B, V, 3). Differentiable."""
         if is_plain(shift, self.weight) and len(shift):
             n_strips, each = strips(len(self.vertex), shift.device)
             cloth = shift.new_empty(len(shift), len(self.vertex), 3)

@@ -1,4 +1,4 @@
-"""How far the skin takes a garment along, when no derivative is asked for: one code for CPU and CUDA."""
+"""How far skin takes a garment along, when no derivative is needed: the same code for CPU and CUDA."""
 
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,7 @@ from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 wp.set_module_options({"enable_backward": False})
 
 N_BELOW = 8
-"""Body vertices that a garment's vertex lies on."""
+"""Number of body vertices that a garment vertex lies on."""
 
 if TYPE_CHECKING:
     Vertices = wp.Vector[int]
@@ -28,7 +28,7 @@ def follow_kernel(
     # output
     cloth: wp.array2d[wp.vec3],
 ) -> None:
-    """The means of the skin's vectors that each of the garment's vertices lies on, `each` in number a thread."""
+    """Averages the vectors of the body vertices that a garment vertex lies on, `each` garment vertices per thread."""
     b, strip = wp.tid()
     for i in range(strip * each[0], wp.min((strip + 1) * each[0], vertex.shape[0])):
         vertices = vertex[i]

@@ -1,4 +1,4 @@
-"""What is known of a garment besides its mesh, and how its file says it: a JSON text under the key `card`."""
+"""What is known of a garment besides its mesh, and how its file stores that: as JSON text under the key `card`."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ class Tailoring:
     mean: float
     """Added to the template as it was cut: the middle of the range."""
     std: float
-    """Of the parameter; γ of ±2 reaches two of them."""
+    """Standard deviation of the parameter; γ of ±2 reaches two of them."""
 
 
 @dataclass(frozen=True)
 class GarmentCard:
     """What is known of a garment besides its mesh.
 
-    Raises `ValueError` for what makes no garment.
+    Raises `ValueError` for values that no garment has.
     """
 
     layer: int
-    """Garments are worn over those of a lower number; of one layer, the later named is the outer."""
+    """A garment is worn over those with a lower number; within a layer, the one named later is the outer one."""
     color: tuple[float, float, float]
     """sRGB, 0 to 1."""
     joints: tuple[int, ...]
-    """Joints that the garment can feel (Patel et al. 2020); the others would only be a source of overfitting."""
+    """Joints that affect the garment (Patel et al. 2020); the others would only be a source of overfitting."""
     held_at_waist: bool
     """Whether a waistband holds it; otherwise it hangs from the shoulders."""
     tailoring: tuple[Tailoring, ...]
@@ -70,12 +70,12 @@ class GarmentCard:
 
 
 def card_to_json(card: GarmentCard) -> str:
-    """The card as a garment's file has it."""
+    """The card as JSON, as a garment's file stores it."""
     return json.dumps(asdict(card))
 
 
 def json_to_card(text: bytes | str) -> GarmentCard:
-    """The inverse of `card_to_json`. Raises `ValueError` for what is no card, `RecursionError` for JSON too deep."""
+    """The inverse of `card_to_json`. Raises `ValueError` if it isn't a card, `RecursionError` if nested too deeply."""
     values = parse_json(text.encode() if isinstance(text, str) else text)
     wanted = [field.name for field in fields(GarmentCard)]
     if not isinstance(values, dict) or sorted(values) != sorted(wanted):

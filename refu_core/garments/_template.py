@@ -32,7 +32,7 @@ class UvMap:
     coordinates: NDArray[np.float32]
     """Shape (T, 2)."""
     faces: NDArray[np.int64]
-    """Which of them each corner of each face has, shape (F, 3)."""
+    """Which of the coordinates each corner of each face has, shape (F, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class GarmentTemplate:
     """
 
     name: str
-    """That of its file, and of the folder of its weights."""
+    """The name of its file, and of the folder of its weights."""
     body: str
     """Name of the built-in body that the garment was cut for."""
     card: GarmentCard
@@ -56,11 +56,11 @@ class GarmentTemplate:
     v_template: Tensor
     """Mean garment on the mean body in the T-pose, SMPL axes [m], shape (V, 3)."""
     shapedirs: Tensor
-    """Displacement a unit of each beta [m], shape (V * 3, 10)."""
+    """Displacement per unit of each beta [m], shape (V * 3, 10)."""
     styledirs: Tensor | None
-    """Displacement a unit of each style component γ [m], shape (V * 3, 4); None for a garment of one style."""
+    """Displacement per unit of each style component γ [m], shape (V * 3, 4); None for a garment of one style."""
     uv: UvMap | None = None
-    """Texture coordinates; None for a garment without."""
+    """Texture coordinates; None for a garment without them."""
 
     @property
     def n_vertices(self) -> int:
@@ -69,7 +69,7 @@ class GarmentTemplate:
 
     @cached_property
     def mesh(self) -> Connectivity:
-        """What is next to what in it."""
+        """The connectivity of its mesh."""
         return Connectivity.of(self.faces.cpu().numpy(), self.n_vertices)
 
     @cached_property
@@ -94,7 +94,7 @@ class GarmentTemplate:
     def rest(self, betas: Tensor, style: Tensor | None = None) -> Tensor:
         """The template t(β, γ) in the T-pose [m], shape (B, V, 3), for betas (B, 10) and style (B, 4) or None.
 
-        Raises `GarmentError`: a style was asked of a garment that has one style only.
+        Raises `GarmentError` if a style is given for a garment that has one style only.
         """
         require_type(betas, Tensor, _TENSOR, error=GarmentError)
         offset = betas @ self.shapedirs.T
@@ -106,7 +106,7 @@ class GarmentTemplate:
         return self.v_template + offset.view(len(offset), self.n_vertices, 3)
 
     def own(self, style: Tensor | None) -> Tensor | None:
-        """The style γ as it is; None for a garment of one style, whose samples have a γ all the same."""
+        """The style γ unchanged; None for a garment of one style, whose samples carry a γ all the same."""
         return None if self.styledirs is None else style
 
     def vertex_transforms(self, transforms: RigidTransforms) -> RigidTransforms:

@@ -1,4 +1,4 @@
-"""Garments on another body than the one that they were cut for."""
+"""Garments on a body other than the one that they were cut for."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from refu_core.garments._template import GarmentTemplate
 Array = NDArray[np.float64]
 
 _NEIGHBOURS = 16
-"""Vertices of the skin that a garment's vertex is carried by."""
+"""Number of skin vertices that a garment vertex is carried by."""
 _WIDTH = 0.02
-"""How much farther than the nearest one these may be to count for much [m]."""
+"""How much farther than the nearest one these may be and still count much [m]."""
 _STIFFNESS = 20.0
-"""How much more it counts that neighbours move alike than that they move as the skin does: cloth doesn't show a navel.
-Half of what changes within 7 edges, 7 cm of a T-shirt, is levelled."""
+"""Weight of neighbours moving alike, relative to that of their moving as the skin does: cloth doesn't show a navel.
+Half of what changes within 7 edges, 7 cm of a T-shirt, is levelled out."""
 _HELD_WITHIN = 0.03
-"""Cloth that is farther off the skin than this follows its own neighbours rather [m]: between two legs, neither one."""
+"""Cloth farther off the skin than this mostly follows its own neighbours [m]: between two legs it follows neither."""
 _CLEARANCE = 0.006
-"""What garments are cut clear of their body [m]: no more is asked for on another."""
+"""How far off their body garments are cut [m]: no more is required on another body."""
 _FROM_MIDDLE = 0.003
-"""What vertices keep from the plane between left and right, if they have as much as cut [m]."""
+"""How far vertices stay from the plane between left and right, if they are cut that far from it [m]."""
 _LIFTS = 6
 """Rounds of lifting: hardly anything is below its clearance after three."""
 _SPREADS = 3
-"""Rings around a vertex that is lifted that go along, less and less."""
+"""Rings around a lifted vertex that move along with it, less and less."""
 _INFLUENCES = 6
-"""Joints of a vertex, as in the garments that ship."""
+"""Most joints per vertex, as in the garments that ship."""
 
 
 def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
-    """`garment` on the body of `fit`: it follows that body's betas and skin, and its styles are as they were.
+    """`garment` on the body of `fit`: it follows that body's betas and skin, and its styles stay as they were.
 
-    Itself on the body that it was cut for, which None stands for.
+    Returns the garment itself for the body that it was cut for, which None stands for.
 
-    What of the body is in the shape space of the one that the garment was cut for, the garment knows already how to
-    follow. The rest is carried over by the skin below it. So nothing changes on the garment's own body.
+    The garment already follows whatever is in the shape space of the body that it was cut for. What else is different
+    about the new body is carried over from the skin below the garment. So nothing changes on the garment's own body.
     """
     if fit is None or fit.body.fingerprint == load_body(garment.body).fingerprint:
         return garment
@@ -76,7 +76,7 @@ def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
 
 
 class _Carrier:
-    """Takes what skin does over to the cloth on it."""
+    """Carries what skin does over to the cloth on it."""
 
     def __init__(self, rest: Array, garment: GarmentTemplate, skin: Array) -> None:
         distance, vertex = map(np.asarray, cKDTree(skin).query(rest, _NEIGHBOURS))
@@ -89,15 +89,18 @@ class _Carrier:
         self._solve = splu(sparse.csc_array(sparse.diags_array(self._hold) + _STIFFNESS * bending.T @ bending)).solve
 
     def __call__(self, values: Array) -> Array:
-        """Of the skin's vertices (V, …) at the garment's (N, …)."""
+        """`values` of the skin's vertices (V, …), carried over to the garment's (N, …)."""
         there = self._attach @ values.reshape(len(values), -1)
         levelled: Array = self._solve(self._hold[:, None] * there)
         return levelled.reshape(-1, *values.shape[1:])
 
 
 def _on_own_side(vertices: Array, own_side: Array, middle: float) -> Array:
-    """Vertices on the side of the body's middle, at x = `middle`, that they are on as cut, x (N,) both [m]: one trouser
-    leg isn't in the other on a body whose legs are nearer together."""
+    """Vertices, each brought to the side of the body's middle plane x = `middle` [m] that it is cut on.
+
+    As cut, the vertices are `own_side` (N,) [m] from the middle. This keeps one trouser leg out of the other on a body
+    whose legs are closer together.
+    """
     side: Array = np.where(own_side > 0, 1.0, -1.0)
     kept: Array = vertices.copy()
     least = np.minimum(np.abs(own_side), _FROM_MIDDLE)
@@ -106,7 +109,7 @@ def _on_own_side(vertices: Array, own_side: Array, middle: float) -> Array:
 
 
 def _lifted(vertices: Array, clear: Array, garment: GarmentTemplate, fit: BodyFit) -> Array:
-    """Vertices and the middles of edges at least as far off the body as `clear` (N,) [m]."""
+    """Vertices, lifted so that they and the midpoints of edges are at least `clear` (N,) [m] off the body."""
     surface = Surface(fit.body.v_template.double().cpu().numpy(), fit.body.faces.cpu().numpy().astype(np.int32))
     edges = garment.mesh.edges
     mean = sparse.csr_array(sparse.eye_array(len(vertices)) - garment.mesh.uniform_laplacian())
@@ -117,7 +120,7 @@ def _lifted(vertices: Array, clear: Array, garment: GarmentTemplate, fit: BodyFi
         lacks = np.concatenate((clear, clear[edges].mean(1))) - height
         if lacks.max() <= 0:
             break
-        # Of a vertex and the edges at it, the one that lacks most says which way.
+        # Of a vertex and its edges, the one that lacks most sets the push.
         lacks, owner = np.concatenate((lacks[:n], lacks[n:], lacks[n:])), np.concatenate((np.arange(n), *edges.T))
         which = np.concatenate((np.arange(len(points)), np.arange(n, len(points))))
         order = np.argsort(lacks)

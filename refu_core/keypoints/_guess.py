@@ -13,15 +13,15 @@ Array = NDArray[np.float64]
 _TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17)
 """Joints that turn with the pelvis, more or less."""
 _LIMBS = ((16, 18, 20, 1.0), (17, 19, 21, 1.0), (1, 4, 7, -1.0), (2, 5, 8, -1.0))
-"""Ball, hinge, end; and where the end goes in the T-pose as the hinge bends, along z: forearms forward, shins back."""
+"""Ball, hinge, end; and which way along z a bending hinge moves the end in the T-pose: forearms forward, shins back."""
 _LEAST = 0.05
-"""Length [m] of what a direction is taken from, and half the width of a trunk that shows which way it faces."""
+"""Least length [m] of a vector that gives a direction; least half width of a trunk that shows which way it faces."""
 _BENT = 0.15
-"""Sine of a bend that shows which way a limb is turned."""
+"""Least sine of a bend that shows which way a limb is turned."""
 
 
 def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start: Pose) -> Pose | None:
-    """A pose near that of keypoints [m], shape (K, 3), as far as seen, shape (K,); None for too few of them."""
+    """A pose near that of keypoints [m], shape (K, 3), of which those `seen`, shape (K,), count; None for too few."""
     joints = skeleton.layout.joints
     upright = Pose(start.pelvis, np.broadcast_to(np.eye(3), start.turns.shape).copy(), start.betas)
     rest = skeleton.posed(upright).points
@@ -54,7 +54,7 @@ def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start
 
 
 def _turn_above(turns: Array, joint: int) -> Array:
-    """Of a joint's parent in the world."""
+    """Rotation of a joint's parent in the world."""
     turn = np.eye(3)
     while (joint := PARENTS[joint]) >= 0:
         turn = turns[joint] @ turn
@@ -71,7 +71,7 @@ def _shortest(start: Array, end: Array) -> Array:
     a, b = _unit(start), _unit(end)
     axis = np.cross(a, b)
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
-    if sine < 1e-9:  # the same way, or the opposite one, about any axis across
+    if sine < 1e-9:  # the same direction, or the opposite one: any perpendicular axis will do
         axis = _unit(np.cross(a, np.eye(3)[np.abs(a).argmin()]))
     angle = np.arctan2(sine, cosine)
     turn: Array = exp_so3(_unit(axis)[None] * angle)[0]
@@ -79,7 +79,7 @@ def _shortest(start: Array, end: Array) -> Array:
 
 
 def _aligned(bone: Array, bend: Array, upper: Array, lower: Array) -> Array:
-    """The rotation of a bone onto `upper` that bends the limb towards `lower`, as far as that shows."""
+    """The rotation of a bone onto `upper` that bends the limb towards `lower`, if the bend shows."""
     along = _unit(upper)
     side = _unit(lower) - (_unit(lower) @ along) * along
     if np.linalg.norm(side) < _BENT:

@@ -42,8 +42,8 @@ _POINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
     "l_small_toe": ("left_foot", (0.055, -0.012, 0.0)),
     "l_heel": ("left_ankle", (-0.01, -0.036, -0.055)),
 }
-"""Joint and way from it [m] in the T-pose, in SMPL's axes, measured on the built-in neutral body's mean shape; a right
-side mirrors the left one."""
+"""Joint and offset from it [m] in the T-pose, in SMPL's axes, measured on the built-in neutral body's mean shape; the
+right side mirrors the left one."""
 
 _COCO = "nose l_eye r_eye l_ear r_ear l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist l_hip r_hip l_knee r_knee "
 _COCO += "l_ankle r_ankle"
@@ -70,8 +70,8 @@ _NAMES: dict[str, str] = {
     "smpl24": "pelvis l_hip r_hip spine_low l_knee r_knee spine_mid l_ankle r_ankle spine_high l_foot r_foot neck "
     "l_clavicle r_clavicle head l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist l_palm r_palm",
 }
-"""Points of each layout, in the order in which trackers send them. A thorax, a clavicle, fingers and MediaPipe's eye
-corners are where they are within 2 cm."""
+"""Points of each layout, in the order in which trackers send them. The places of thorax, clavicles, fingers and
+MediaPipe's eye corners are only right within 2 cm."""
 LAYOUTS: tuple[str, ...] = tuple(_NAMES)
 
 
@@ -81,11 +81,11 @@ class KeypointLayout:
 
     name: str
     joints: NDArray[np.intp]
-    """The joint that carries each, shape (K,)."""
+    """The joint that carries each keypoint, shape (K,)."""
     offsets: NDArray[np.float64]
-    """From it in the T-pose [m], shape (K, 3)."""
+    """Offset from that joint in the T-pose [m], shape (K, 3)."""
     mirrored: NDArray[np.intp]
-    """The keypoint on the other side of each, shape (K,); itself in the middle."""
+    """Each keypoint's counterpart on the body's other side, shape (K,); itself if it is in the middle."""
 
     def __len__(self) -> int:
         """Number of keypoints."""
@@ -107,7 +107,7 @@ def keypoint_layout(name: str) -> KeypointLayout:
 
 
 def layout_of(name: str, words: tuple[str, ...]) -> KeypointLayout:
-    """A layout of points of the table, in any order. Raises `KeyError` for one that isn't there."""
+    """A layout of points of the table, in any order. Raises `KeyError` for a point that isn't in the table."""
     places = [_place(word) for word in words]
     joints = np.array([SMPL_JOINTS.index(joint) for joint, _ in places])
     offsets = np.array([offset for _, offset in places], np.float64)
@@ -122,7 +122,7 @@ def _place(word: str) -> tuple[str, tuple[float, float, float]]:
 
 
 def _twin(words: tuple[str, ...], i: int) -> int:
-    """The number of the same point on the other side; of several of one name the one that comes as late."""
+    """The number of the same point on the other side; of several with one name, the one of the same rank."""
     word = words[i]
     if word[:2] not in ("l_", "r_"):
         return i

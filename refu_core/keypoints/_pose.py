@@ -23,7 +23,7 @@ _ABOVE = np.array(PARENTS)
 
 
 def _hops() -> list[NDArray[np.intp]]:
-    """The joint that is 1, 2, 4, 8 above each, shape (24,); 24 beyond the root."""
+    """The joints that are 1, 2, 4, 8 levels above each, shape (24,) per level; 24 where that is beyond the root."""
     hops, above = [], np.append(np.where(_ABOVE < 0, N_JOINTS, _ABOVE), N_JOINTS)
     while (above < N_JOINTS).any():
         hops.append(above[:-1])
@@ -35,7 +35,7 @@ _HOPS = _hops()
 _IDENTITY = np.eye(3)
 _CROSSES = np.stack([np.cross(axis, _IDENTITY).T.ravel() for axis in _IDENTITY])  # 3, 9: each axis as a skew matrix
 _NEARLY_HALF = -1.98  # twice the cosine of 172°
-_TINY = 1e-40  # beside a square, lest nothing is divided by nothing
+_TINY = 1e-40  # added to a square, so that zero is never divided by zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +43,13 @@ class Proportions:
     """The joints of a body in the T-pose as a function of its betas."""
 
     joints: Array
-    """Of the mean shape [m], shape (24, 3)."""
+    """Joints of the mean shape [m], shape (24, 3)."""
     shapedirs: Array
     """How a unit of each beta moves them [m], shape (24, 3, 10)."""
 
     @classmethod
     def builtin(cls, name: str) -> Proportions:
-        """Those of a built-in body. Raises `BodyError`."""
+        """The proportions of a built-in body. Raises `BodyError`."""
         keys = ("v_template", "J_regressor", "shapedirs")
         if name not in BUILTIN_BODIES:
             msg = f"no built-in body {name!r}: wanted one of {', '.join(BUILTIN_BODIES)}"
@@ -62,7 +62,7 @@ class Proportions:
 
     @classmethod
     def of_body(cls, body: Any) -> Proportions:
-        """Those of an `SmplBody`."""
+        """The proportions of an `SmplBody`."""
         import torch
 
         betas = torch.cat([torch.zeros(1, N_BETAS), torch.eye(N_BETAS)]).to(body.device, body.dtype)
@@ -70,7 +70,7 @@ class Proportions:
         return cls(joints[0], np.moveaxis(joints[1:] - joints[0], 0, -1))
 
     def of(self, betas: Array) -> Array:
-        """Joints in the T-pose [m], shape (24, 3), of betas (10,)."""
+        """Joints in the T-pose [m], shape (24, 3), for betas (10,)."""
         joints: Array = self.joints + self.shapedirs @ betas
         return joints
 
@@ -79,11 +79,11 @@ class Posed(NamedTuple):
     """A posed skeleton and its keypoints."""
 
     turns: Array
-    """Of each joint in the world, shape (24, 3, 3)."""
+    """Rotation of each joint in the world, shape (24, 3, 3)."""
     joints: Array
     """[m], shape (24, 3)."""
     moves: Array
-    """How a unit of each beta moves a joint, and all that it carries [m], shape (24, 3, 10)."""
+    """How a unit of each beta moves a joint and all that it carries [m], shape (24, 3, 10)."""
     points: Array
     """Keypoints [m], shape (K, 3)."""
 
@@ -93,14 +93,14 @@ class Pose:
     """Where a person is and how they stand."""
 
     pelvis: Array
-    """Of the root joint [m], shape (3,)."""
+    """Place of the root joint [m], shape (3,)."""
     turns: Array
     """Rotation of each joint in its parent, shape (24, 3, 3)."""
     betas: Array
-    """Shape (10,)."""
+    """Shape coefficients, shape (10,)."""
 
     def moved(self, step: Array, *, most_beta: float = np.inf) -> Pose:
-        """By (pelvis 3 [m], turns 24 * 3 [rad] in the joint's own axes, betas 10), shape (85,).
+        """The pose after a step (pelvis 3 [m], turns 24 * 3 [rad] in the joint's own axes, betas 10), shape (85,).
 
         Betas stay within `most_beta`.
         """
@@ -117,22 +117,22 @@ class Skeleton:
         self.proportions = proportions
         above = np.maximum(_ABOVE, 0)
         bones, dirs = (given - given[above] for given in (proportions.joints, proportions.shapedirs))
-        self._bones = np.concatenate([bones[:, :, None], dirs], axis=2)  # from its parent to each joint, and by beta
+        self._bones = np.concatenate([bones[:, :, None], dirs], axis=2)  # from its parent to each joint, and per beta
         carried = CARRIED[layout.joints]
         carried[np.arange(len(layout)), layout.joints] *= layout.offsets.any(axis=1)
         self.turning = np.flatnonzero(carried.any(axis=0))
         """Joints that move a keypoint when they turn, shape (m,)."""
         self.carried = carried[:, self.turning]
-        """Whether a keypoint moves when each of those turns, 0 or 1, shape (K, m)."""
+        """Whether a keypoint moves (1) or not (0) when each of those joints turns, shape (K, m)."""
         self._last: tuple[Pose, Posed] | None = None
 
     def bones(self, betas: Array) -> Array:
-        """From each joint's parent to it in the T-pose [m], shape (24, 3)."""
+        """The vector from each joint's parent to it in the T-pose [m], shape (24, 3)."""
         bones: Array = self._bones[:, :, 0] + self._bones[:, :, 1:] @ betas
         return bones
 
     def posed(self, pose: Pose) -> Posed:
-        """Joints and keypoints of a pose; of the last one asked for they are known."""
+        """Joints and keypoints of a pose; those of the last pose are remembered."""
         if self._last is None or self._last[0] is not pose:
             self._last = pose, self._posed(pose)
         return self._last[1]
@@ -140,7 +140,7 @@ class Skeleton:
     def _posed(self, pose: Pose) -> Posed:
         turns = np.empty((N_JOINTS + 1, 3, 3))
         turns[:N_JOINTS], turns[N_JOINTS] = pose.turns, _IDENTITY
-        for above in _HOPS:  # each turn is that of a chain twice as long after each round
+        for above in _HOPS:  # each round doubles the length of the chain that a turn is the product of
             turns[:N_JOINTS] = turns[above] @ turns[:N_JOINTS]
         bones = turns[_HOPS[0]] @ self._bones
         reach = (CARRIED @ bones.reshape(N_JOINTS, -1)).reshape(bones.shape)
@@ -151,7 +151,7 @@ class Skeleton:
         return Posed(turns, joints, moves, points)
 
     def jacobian(self, posed: Posed, *, of_betas: bool) -> Array:
-        """How keypoints move with the pelvis, each of `turning` about the joint's own axes, and betas if wanted.
+        """How keypoints move with the pelvis, with each joint of `turning` about its own axes, and betas if wanted.
 
         Shape (3 K, 3 + 3 m + 10), or without the 10.
         """
@@ -175,7 +175,7 @@ def log_so3(matrices: Array) -> Array:
     twice_sine = np.sqrt(np.einsum("ij,ij->i", vector, vector) + _TINY)
     twice_cosine = np.einsum("ijj->i", matrices) - 1
     result: Array = (np.arctan2(twice_sine, twice_cosine) / twice_sine)[:, None] * vector
-    for i in np.flatnonzero(twice_cosine < _NEARLY_HALF):  # the difference vanishes there
+    for i in np.flatnonzero(twice_cosine < _NEARLY_HALF):  # near half a turn, where the sine vanishes
         result[i] = Rotation.from_matrix(matrices[i]).as_rotvec()
     return result
 

@@ -1,4 +1,4 @@
-"""The most likely pose of keypoints: Gauss-Newton steps on what is seen, what was predicted, and joints at rest."""
+"""The most likely pose for keypoints: Gauss-Newton steps on what is seen, what was predicted, and how joints rest."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ def resting() -> tuple[Array, Array]:
 
 N_PARTS = 3 + 3 * N_JOINTS + N_BETAS
 TURNS, BETAS = slice(3, 3 + 3 * N_JOINTS), slice(3 + 3 * N_JOINTS, N_PARTS)
-"""Of the numbers of a step as `Pose.moved` takes it."""
+"""Where turns and betas are in a step, as `Pose.moved` takes it."""
 MEAN, SPREAD = resting()
 
 _FLAT = 1e-2
-"""Precision of what nothing is known of."""
+"""Precision of a number of which nothing is known."""
 _LOOSE = 0.1
 """How far a first guess may be off [m]."""
 _CLOSE = 2e-3
-"""Where a step moves the keypoints as a linear one would, but for so much [m], it was the last."""
+"""A step that moves every keypoint to within this of where a linear one would is the last [m]."""
 _BOLDEST = 0.6
-"""A step turns no joint by more [rad]."""
+"""A step turns no joint by more than this [rad]."""
 
 
 class Solution(NamedTuple):
@@ -68,13 +68,13 @@ class Solution(NamedTuple):
 
     pose: Pose
     variance: Array
-    """Of its parts, shape (85,)."""
+    """Variance of each of its parts, shape (85,)."""
     step: Array
-    """From where it was looked for to it, shape (85,)."""
+    """The step to it from the pose where the search began, shape (85,)."""
 
 
 class Solver:
-    """Finds the most likely pose of one skeleton's keypoints, and its betas where it `fits_betas`."""
+    """Finds the most likely pose of one skeleton's keypoints, and its betas too if it `fits_betas`."""
 
     def __init__(self, skeleton: Skeleton, *, fits_betas: bool, settings: TrackerSettings) -> None:
         self._skeleton = skeleton
@@ -102,19 +102,19 @@ class Solver:
         """The most likely pose near `pose`.
 
         Args:
-            pose: where it is looked for: the prediction, or a guess.
+            pose: where the search begins: the prediction, or a guess.
             points: keypoints [m], shape (K, 3).
             weights: how far each is believed, 0 to 1, shape (K,).
             deviation: of each keypoint along an axis [m], shape (K,).
-            prior: precision of the prediction's parts, shape (85,); None for a guess, which pulls at nothing.
-            rest: the share of a look that joints at rest count as.
+            prior: precision of the prediction's parts, shape (85,); None for a guess, which has no pull.
+            rest: how much the pull of joints to their rest counts, from 0 to 1 for a full observation.
             steps: Gauss-Newton steps at most.
         """
         precision = np.full(N_PARTS, _FLAT) if prior is None else prior
         noise, free = np.square(deviation), self._free
         posed = self._skeleton.posed(pose)
         jacobian = self._skeleton.jacobian(posed, of_betas=self._fits_betas)
-        # How far off a keypoint may be that is none the worse: by its own noise and by that of the prediction.
+        # How far off a sound keypoint may be: by its own noise and by that of the prediction.
         doubt = _LOOSE**2 if prior is None else (np.square(jacobian) @ (1 / prior[free])).reshape(-1, 3).mean(axis=1)
         tolerated = self._settings.outlier**2 * 3 * (noise + doubt)
         step, factor, resting = np.zeros(N_PARTS), None, _Resting(pose, rest)
@@ -128,7 +128,7 @@ class Solver:
             matrix.reshape(-1)[:: len(matrix) + 1] += (precision + pulled)[free]
             matrix[self._blocks] += resting.stiffness[self._skeleton.turning]
             found, info = dpotrf(matrix, lower=1)
-            if info:  # not positive: keypoints that say nothing
+            if info:  # not positive definite: the keypoints say nothing
                 break
             factor = found
             pull = resting.pull - precision * step
@@ -139,7 +139,7 @@ class Solver:
             short = min(1.0, _BOLDEST / max(float(np.abs(change[TURNS]).max()), 1e-9))
             change *= short
             pose = pose.moved(change, most_beta=self._settings.most_beta)
-            step += change  # turns that follow each other add up, as long as the second one is small
+            step += change  # successive turns add up, as long as the second one is small
             if k + 1 == steps:
                 break
             linear = posed.points + short * (jacobian @ solved).reshape(-1, 3)
@@ -180,7 +180,7 @@ def _inverse_right_jacobian(vectors: Array) -> Array:
     """How rotation vectors (n, 3) change with a turn in the joint's own axes, shape (n, 3, 3)."""
     squared = np.einsum("ij,ij->i", vectors, vectors)
     half = 0.5 * np.sqrt(np.maximum(squared, 1e-6))
-    # Finite and smooth up to 2π, since a cotangent has the cosine over the sine.
+    # Written with the half angle's cotangent, which keeps it finite and smooth up to 2π.
     factor = np.where(squared < 1e-6, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))[:, None, None]
     result: Array = (1 - factor * squared[:, None, None]) * np.eye(3) + 0.5 * skew(vectors)
     result += (factor * vectors[:, :, None]) * vectors[:, None, :]

@@ -1,9 +1,9 @@
 """A person's keypoints, frame by frame, to a pose of SMPL: a Kalman filter on the pose.
 
 The state is a pose (pelvis, the turns of the joints, betas) and the rates of its parts, each with its variance. A frame
-of keypoints updates it by Gauss-Newton steps towards the most likely pose: of the keypoints as far as they are seen and
-believed, of the pose that was predicted, and of what joints do at rest. So bones keep their lengths, a joint that isn't
-seen goes on for a while and then comes to rest, and how much a keypoint moves the pose follows from how sure both are.
+of keypoints updates it by Gauss-Newton steps towards the most likely pose, given the keypoints as far as they are seen
+and believed, the predicted pose, and how joints rest. So bones keep their lengths, a joint that isn't seen moves on for
+a while and then comes to rest, and how much a keypoint moves the pose depends on how certain both are.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class _Seen(NamedTuple):
 
 
 class KeypointTracker:
-    """One person, by keypoints of a skeleton on the body that is dressed. Not thread-safe.
+    """Tracks one person by keypoints of a skeleton, that of the body that is dressed. Not thread-safe.
 
     The person's `betas` (10,) are estimated from the lengths of bones if they aren't given.
     """
@@ -71,21 +71,21 @@ class KeypointTracker:
 
     @property
     def stamp_ns(self) -> int:
-        """Of the newest keypoints, 0 without a person [ns]."""
+        """Time stamp of the newest keypoints, 0 without a person [ns]."""
         return self._stamp
 
     def update(self, points: ArrayLike, stamp_ns: int, *, confidence: ArrayLike | None = None) -> SmplFrame | None:
-        """The pose after a frame of keypoints, None while there is no person to be seen.
+        """The pose after a frame of keypoints, None while no person is seen.
 
         Args:
             points: [m], shape (K, 3); a keypoint that isn't seen is NaN, or has no confidence.
-            stamp_ns: when they were seen [ns]. What is older than the newest changes nothing; after a second without
-                any, or of a clock that was set back by more, the track begins anew.
-            confidence: from 0 to 1, shape (K,); NaN and negative numbers are none. Whatever reaches above 1 counts to
-                100.
+            stamp_ns: when they were seen [ns]. Keypoints older than the newest change nothing; after a second without
+                any, or if the clock was set back by more than that, the track begins anew.
+            confidence: from 0 to 1, shape (K,); NaN and negative numbers count as 0. In a frame that has one above 2,
+                all are out of 100.
 
         Raises:
-            FrameError: another number of keypoints, or no numbers.
+            FrameError: another number of keypoints, or values that aren't numbers.
         """
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
@@ -111,9 +111,9 @@ class KeypointTracker:
         return self.at(stamp_ns)
 
     def at(self, stamp_ns: int) -> SmplFrame | None:
-        """The pose at another time, before the next keypoints: rates go on, and die away.
+        """The pose at another time, before the next keypoints: rates continue, and die away.
 
-        None where nobody was seen for `hold`.
+        None if nobody was seen for `hold`.
         """
         if self._pose is None or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None
@@ -160,7 +160,7 @@ class KeypointTracker:
         return self.at(stamp_ns)
 
     def _guessed(self, seen: _Seen) -> tuple[Pose, Array, float] | None:
-        """The pose, its variances, and how badly it fits [m], from one frame alone, left and right as it fits best."""
+        """The pose, its variances, and how badly it fits [m], from one frame alone, left and right as they fit best."""
         found = []
         other = self.skeleton.layout.mirrored
         for sides in (seen, _Seen(seen.points[other], seen.weights[other])):
@@ -184,7 +184,7 @@ class KeypointTracker:
         self._swapped_for = self._unfit_for = 0.0
 
     def _begin_again(self, seen: _Seen) -> None:
-        """Where the pose hasn't fitted for long: from this frame alone, if that fits better."""
+        """Starts again from this frame alone if that fits better, once the pose hasn't fitted for long."""
         assert self._pose is not None
         self._unfit_for = 0.0
         guess = self._guessed(seen)
@@ -192,14 +192,14 @@ class KeypointTracker:
             self._take(*guess)
 
     def _misfit(self, pose: Pose, seen: _Seen) -> float:
-        """Median distance of keypoints from where the pose has them [m], the farther half of it."""
+        """Root mean square distance of keypoints from where the pose has them, each at most 0.5 [m]."""
         off = np.linalg.norm(self.skeleton.posed(pose).points - seen.points, axis=1)[seen.weights > 0]
         return float(np.sqrt(np.mean(np.minimum(off, 0.5) ** 2))) if len(off) else 0.0
 
     def _sided(self, seen: _Seen, dt: float) -> _Seen | None:
-        """The frame with arms, legs or face exchanged where they are on the wrong side; None if it is somebody else's.
+        """The frame with the sides of arms, legs or face exchanged if they are wrong; None if it is somebody else's.
 
-        Nothing is done for keypoints that are all near where they were expected.
+        If all keypoints are near where they were expected, nothing is changed.
         """
         assert self._pose is not None
         expected = self.skeleton.posed(self._pose).points
@@ -228,7 +228,7 @@ class KeypointTracker:
     # The filter -----------------------------------------------------------------------------------
 
     def _predict(self, dt: float) -> None:
-        """Constant rates that die away; variances of the same."""
+        """Moves the pose on by rates that die away, and the variances with it."""
         assert self._pose is not None
         own = self._settings
         keep = math.exp(-dt / own.coast)
@@ -258,14 +258,14 @@ class KeypointTracker:
         self._learn_noise(seen, dt)
 
     def _learn_noise(self, seen: _Seen, dt: float) -> None:
-        """Follows what the tracker's noise is, by the median of what is left."""
+        """Adapts to the tracker's noise, by the median distance that is left after the fit."""
         assert self._pose is not None
         off = self.skeleton.posed(self._pose).points - seen.points
         squared = np.sort(np.einsum("ki,ki->k", off, off)[seen.weights > 0])
         if len(squared) < 4:
             return
         own, median = self._settings, math.sqrt(squared[len(squared) // 2])
-        # Of three normal components the median length is 1.54 deviations; the fit takes up about a quarter of them.
+        # Of three normal components the median length is 1.54 deviations; the fit takes up about a quarter of it.
         target = min(max(median / 1.54 * 1.25, own.least_noise), own.most_noise)
         self._noise += min(1.0, dt) * (target - self._noise)
         self._unfit_for = self._unfit_for + dt if median > max(4 * self._noise, 0.08) else 0.0
@@ -280,19 +280,19 @@ class KeypointTracker:
 _GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
 """Joints of arms, legs and head, whose keypoints trackers exchange together."""
 _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zeros(N_BETAS)])
-"""No pelvis [m/s], no joint [rad/s] is faster."""
+"""No pelvis [m/s] and no joint [rad/s] is faster than this."""
 _LEAST = 0.05
-"""A confidence below it is none."""
+"""A confidence below this counts as none."""
 _MOST_SCORE = 2.0
-"""Detectors that score by the height of a heat map go a little beyond 1; larger ones are per cent."""
+"""Detectors that score by the height of a heat map go a little beyond 1; scores above this are per cent."""
 _FITS = 0.04
-"""A first pose that its keypoints lie so near to [m] has its sides right."""
+"""A first pose that misses its keypoints by less than this [m] has its sides right."""
 _NEAR, _FAR = 0.1, 0.5
-"""A keypoint that is nearer to where it was expected is on its side; one that is farther isn't farther yet [m]."""
+"""A keypoint within `_NEAR` of its expected place is on its side; a distance beyond `_FAR` counts as `_FAR` [m]."""
 
 
 MOST_PEOPLE = 64
-"""People who are followed at once; whose keypoints haven't come for longest is forgotten."""
+"""Most people followed at once; beyond that, whoever's keypoints haven't come for longest is forgotten."""
 
 
 @dataclass
@@ -301,11 +301,11 @@ class _Person:
     newest_ns: int
     """Stamp of the newest keypoints, by the sender's clock."""
     came_ns: int
-    """When they came."""
+    """When they came, by the receiver's clock."""
     went_on_ns: int
-    """When there was last a stamp later than the one before."""
+    """When a stamp was last later than the one before it."""
     last_ns: int = -1
-    """The last stamp."""
+    """The last stamp, by the sender's clock."""
 
 
 class People:
@@ -323,7 +323,7 @@ class People:
     ) -> SmplFrame | None:
         """A person's pose after a frame of keypoints; as `KeypointTracker.update`.
 
-        Stamps that haven't gone on for `hold` say nothing: then it is when messages come that counts.
+        Stamps that haven't advanced for `hold` say nothing; the time at which messages come is then used instead.
         """
         one = self._people.pop(person, None)
         if one is None:
@@ -336,17 +336,17 @@ class People:
             stamp_ns = now_ns
         before = one.track.stamp_ns
         frame = one.track.update(points, stamp_ns, confidence=confidence)
-        if one.track.stamp_ns != before:  # or they were older than those that are known
+        if one.track.stamp_ns != before:  # otherwise they were older than those that are known
             one.newest_ns, one.came_ns = stamp_ns, now_ns
         for gone in list(self._people)[:-MOST_PEOPLE]:
             del self._people[gone]
         return frame
 
     def at(self, now_ns: int) -> dict[str, SmplFrame]:
-        """Everybody's pose by now, as far on from their newest keypoints as these are old.
+        """Everybody's pose by now, moved on from their newest keypoints by the age of these.
 
-        The age is that on the receiver's clock: senders' clocks differ. Where it has been set back by more than
-        `hold`, nobody is known to be there until they come again.
+        The age is measured on the receiver's clock, since senders' clocks differ. If that clock was set back by more
+        than `hold`, people are forgotten until their keypoints come again.
         """
         poses = {}
         for person, one in self._people.items():

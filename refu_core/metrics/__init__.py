@@ -1,4 +1,4 @@
-"""Exact collisions, of garments with bodies, themselves and each other, the body's own, and the paper's metrics."""
+"""Exact collisions of garments with bodies, themselves and each other, self-contact of bodies, the paper's metrics."""
 
 from refu_core.metrics._collisions import CollisionChecker as CollisionChecker
 from refu_core.metrics._collisions import Collisions as Collisions

@@ -16,17 +16,17 @@ from refu_core.sdf import ExactSdf, Winding
 
 @dataclass(frozen=True, eq=False)
 class Collisions:
-    """What of one garment collides with the body, exactly."""
+    """The exact collisions of one garment with the body."""
 
     pairs: NDArray[np.int32]
     """Intersecting (garment face, body face), shape (K, 2), in lexicographic order."""
     pair_is_vf: NDArray[np.bool_]
-    """Vertex-face: two edges of one triangle pierce the other, so a vertex has gone through a face. Else edge-edge: one
-    edge of each pierces the other. Shape (K,)."""
+    """Whether a pair is vertex-face: two edges of one triangle pierce the other, so a vertex has gone through a face.
+    Otherwise it is edge-edge: one edge of each pierces the other. Shape (K,)."""
     inside: NDArray[np.bool_]
     """Garment vertices inside the body, by winding number, shape (N,)."""
     depth: NDArray[np.float32]
-    """Their distance to the body's surface [m], 0 for those outside, shape (N,)."""
+    """Distance of these vertices to the body's surface [m], 0 for those outside, shape (N,)."""
 
     @property
     def n_pairs(self) -> int:
@@ -55,12 +55,12 @@ class Collisions:
 
     @property
     def is_free(self) -> bool:
-        """No pair intersects and no vertex is inside: a piece wholly inside crosses no surface, but isn't free."""
+        """Whether no pair intersects and no vertex is inside: a piece wholly inside crosses nothing, but isn't free."""
         return not self.n_pairs and not self.n_inside
 
 
 class CollisionChecker:
-    """Exact check of garments against one body: set the body once a frame, then check each garment.
+    """Exact check of garments against one body: set the body once per frame, then check each garment.
 
     Intersections are those of all pairs of triangles, decided in double precision on float32 vertices. Touching counts
     as intersecting; lying in a face's plane doesn't, so a triangle flat on a body face is found only where it reaches
@@ -90,7 +90,7 @@ class CollisionChecker:
         vertices = as_vertices("the garment's vertices", garment_vertices)
         found = crossings(self._body.mesh_id, vertices, self._triangles_of(garment_faces, vertices))
         points = torch.from_numpy(vertices)
-        # 2 where limbs are in each other; where skin is turned inside out it is -1, and nobody's inside.
+        # It is 2 where limbs overlap, and -1 where skin is turned inside out, which counts as outside.
         inside = (self._winding(points) > 0).numpy()
         depth = np.zeros(len(vertices), np.float32)
         depth[inside] = self._body.query(points[inside]).distance.abs().numpy()
@@ -98,7 +98,7 @@ class CollisionChecker:
         return Collisions(found.pairs, is_vf, inside, depth)
 
     def _triangles_of(self, faces: Any, vertices: NDArray[np.float32]) -> Triangles:
-        # The same few garments frame after frame: comparing faces is a tenth of the work of preparing them.
+        # The same few garments come frame after frame: comparing faces is a tenth of the work of preparing them.
         size = (len(vertices), len(faces))
         known = self._triangles.get(size)
         if known is None or not np.array_equal(known.faces, faces):

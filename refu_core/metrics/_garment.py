@@ -15,9 +15,9 @@ from refu_core.metrics._collisions import Collisions
 from refu_core.metrics._intersect import as_vertices
 
 ON_SKIN = 1e-6
-"""Vertices no deeper than this [m] lie on the skin and not inside: positions of a metre are stored to a tenth of it."""
+"""Vertices no deeper than this [m] lie on the skin, not inside: positions of a metre are stored to a tenth of this."""
 SWEEPS = (1, 4, 16, 64)
-"""Sweeps that each band is what they take away, finest first. Half a step to the mean of the neighbours each."""
+"""Number of sweeps that take each band away, finest first. A sweep goes half way to the mean of the neighbours."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class FrameMetrics:
     n_vertices: int
     """Vertices of the garment."""
     n_inside: int
-    """Of these, inside the body (deeper than `ON_SKIN`); as a percentage of all, VFCP."""
+    """Vertices inside the body (deeper than `ON_SKIN`); as a percentage of all, VFCP."""
     is_free: bool
-    """No vertex inside and no pair of triangles intersects; as a percentage of frames, CFMP."""
+    """Whether no vertex is inside and no pair of triangles intersects; as a percentage of frames, CFMP."""
     n_vf: int
     """Garment triangles with a vertex-face contact; its mean over frames is Avg. VF."""
     n_ee: int
@@ -44,15 +44,15 @@ class FrameMetrics:
     mpve_mm: float | None
     """Mean distance of the vertices to the true ones [mm]; None without a truth."""
     laplacian_mm: float | None
-    """Mean length of the difference between Laplacian and true Laplacian [mm], over the vertices in question; None
-    without a truth or without such a vertex. See `GarmentMetrics.add`."""
+    """Mean length of the difference between Laplacian and true Laplacian [mm], over the resolved vertices; None without
+    a truth or without such a vertex. See `GarmentMetrics.add`."""
     folds: list[list[float]] | None
-    """Energy of the garment's folds and of the true one's, four bands each (`FoldBands`) [m^2]; None without one."""
+    """Energy of the garment's folds and of the true ones, four bands each (`FoldBands`) [m^2]; None without a truth."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Metrics over frames; None where no frame has what it takes."""
+    """Metrics over frames; None where no frame has the data for one."""
 
     n_frames: int
     """Frames the figures are over."""
@@ -75,14 +75,14 @@ class Figures:
     laplacian_mm: float | None
     """Local Laplacian error [mm], mean over the frames that have one."""
     folds_1: float | None
-    """Energy of the garments' folds over that of the true ones', all frames together: of the finest folds, those that
+    """Energy of the garments' folds divided by that of the true ones, over all frames: for the finest folds, those that
     the first levelling sweep takes away (`FoldBands`). Below 1 garments are smoother than cloth."""
     folds_4: float | None
-    """The same of what four more sweeps take away."""
+    """The same for what four more sweeps take away."""
     folds_16: float | None
-    """And sixteen more."""
+    """The same for sixteen more."""
     folds_64: float | None
-    """And 64 more: the widest folds."""
+    """The same for 64 more: the widest folds."""
 
     @staticmethod
     def over(frames: list[FrameMetrics]) -> Figures:
@@ -116,10 +116,10 @@ class Figures:
 
 
 class FoldBands:
-    """Splits a garment into bands: folds of some edges' length, of some more, and the shape that is left.
+    """Splits a garment into bands: folds of a few edges' length, then wider ones, and the shape that is left.
 
     Networks that are trained for a small error predict the mean of what cloth may do, which is smoother than cloth. The
-    mean error hardly says so. The energy of the bands does.
+    mean error hardly shows this. The energy of the bands does.
     """
 
     def __init__(self, mesh: Connectivity) -> None:
@@ -140,7 +140,7 @@ class FoldBands:
         return np.stack([*bands, rest]).reshape(len(SWEEPS) + 1, *array.shape)
 
     def energies(self, vertices: Any) -> NDArray[np.float64]:
-        """Of vertices (V, ..., 3) [m] the energy of each band, finest first [m^2], shape (4, ...)."""
+        """The energy of each band of vertices (V, ..., 3) [m], finest first [m^2], shape (4, ...)."""
         energies: NDArray[np.float64] = (self.split(vertices)[:-1] ** 2).sum(axis=(1, -1))
         return energies
 
@@ -157,9 +157,9 @@ class GarmentMetrics:
     def add(self, vertices: Any, collisions: Collisions, *, truth: Any = None, resolved: Any = None) -> FrameMetrics:
         """Takes in a garment's vertices (N, 3) [m] with their exact collisions; returns figures over all vertices.
 
-        `truth` are the true vertices, where there are some. The local Laplacian error is over those that `resolved`,
-        bool, (N,), marks: what collided before collisions were handled (the supplement's "initial collided vertex");
-        over all by default. Raises `MeshError` for arrays whose shapes don't belong together.
+        `truth` are the true vertices, if there are any. The local Laplacian error is over the vertices that `resolved`,
+        bool, (N,), marks: those that collided before collisions were handled (the supplement's "initial collided
+        vertex"); over all by default. Raises `MeshError` for arrays whose shapes don't belong together.
         """
         garment = as_vertices("the garment's vertices", vertices)
         n = len(garment)

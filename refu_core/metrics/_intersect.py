@@ -35,8 +35,10 @@ class Triangles:
     """A mesh's faces, (G, 3), prepared to be looked at in blocks of neighbours."""
 
     def __init__(self, faces: NDArray[np.int32], vertices: NDArray[np.float32]) -> None:
-        """`vertices` [m], shape (N, 3), say who is near whom, in this pose and so mostly in others: a matter of speed
-        alone."""
+        """`vertices` [m], shape (N, 3), decide which faces are neighbours, in this pose and mostly in others.
+
+        That affects only the speed.
+        """
         self.faces = faces
         order = grouped(vertices[faces].mean(axis=1)) if len(faces) else np.empty(0, np.int64)
         self.blocks = torch.as_tensor(faces[order])
@@ -44,10 +46,10 @@ class Triangles:
 
 
 def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles, *, is_body: bool = False) -> Crossings:
-    """The crossings of a mesh, its vertices (N, 3) [m], with Warp's mesh of that number, the body.
+    """The crossings of a mesh, with vertices (N, 3) [m], and the body, Warp's mesh number `mesh_id`.
 
-    With `is_body` the mesh is that body: pairs are given once, those that share an edge not at all,
-    those that share a vertex where they meet elsewhere, too.
+    With `is_body` the mesh is that body: each pair is given once, faces that share an edge are left out, and
+    faces that share a vertex are given only if they meet elsewhere, too.
     """
     points = torch.as_tensor(vertices)
     n_faces = len(triangles.faces)
@@ -72,7 +74,7 @@ def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles,
         n = int(count)
         if n <= room:
             break
-        room = n  # nothing is cut off: once more, with room for all
+        room = n  # too little room: once more, with room for all
     rows = found[:n].numpy()
     rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     bits = (rows[:, 2:] >> np.arange(6)) & 1 == 1
@@ -91,22 +93,22 @@ class SheetChecker:
         self._triangles: Triangles | None = None
 
     def update(self, vertices: Any) -> None:
-        """Takes over a garment's vertices [m], shape (N, 3). Raises `MeshError` for others, or faces of more."""
+        """Takes over a garment's vertices [m], shape (N, 3). Raises `MeshError` for others, or faces beyond them."""
         points = as_vertices("the garment's vertices", vertices).copy()
         check_faces(self.faces, n_vertices=len(points))
         self._points = torch.from_numpy(points)
         self._mesh = wp.Mesh(as_warp(self._points, wp.vec3), as_warp(self._flat, wp.int32))
 
     def with_itself(self) -> NDArray[np.int32]:
-        """The pairs of its faces that intersect, shape (K, 2); neighbours may meet at an edge or vertex."""
+        """The pairs of its faces that intersect, shape (K, 2); meeting at a shared edge or vertex doesn't count."""
         points = self._points.numpy()
         self._triangles = self._triangles or Triangles(self.faces, points)
         return crossings(self._mesh.id, points, self._triangles, is_body=True).pairs
 
     def with_other(self, vertices: Any, faces: Any) -> NDArray[np.int32]:
-        """Intersecting (other's face, own face), shape (K, 2), of a garment (M, 3) [m] and (F, 3).
+        """Intersecting pairs (other's face, own face), shape (K, 2), with a garment of `vertices` and `faces`.
 
-        Raises `MeshError` for others.
+        The garment is (M, 3) [m] and (F, 3). Raises `MeshError` for other arrays.
         """
         other = as_vertices("the other garment's vertices", vertices)
         triangles = Triangles(check_faces(faces, n_vertices=len(other)), other)

@@ -19,11 +19,11 @@ def intersect_kernel(
     count: wp.array[int],
     pairs: wp.array[wp.vec3i],
 ) -> None:
-    """Appends (face, body face, edges) for each face that meets a body face; counts on beyond the room in `pairs`.
+    """Appends (face, body face, edges) for each face that meets a body face; `count` goes on if `pairs` has no room.
 
-    A thread has `BLOCK` faces in a row, which lie together, so that the tree is walked once for them; `numbers` says
-    what they are called. `edges`: as `meeting_edges`. With `is_body` the faces are the body's own: each pair once, none
-    of two that share an edge.
+    A thread takes `BLOCK` successive faces, which lie together, so that the tree is walked once for them; `numbers`
+    holds their indices in the mesh. `edges` are as `meeting_edges` gives them. With `is_body` the faces are the body's
+    own: each pair is given once, and faces that share an edge are left out.
     """
     first = BLOCK * wp.tid()
     end = wp.min(first + BLOCK, faces.shape[0])

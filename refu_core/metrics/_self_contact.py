@@ -1,4 +1,4 @@
-"""Where a body intersects itself: what the collider is judged by."""
+"""Where a body intersects itself, by which the collider is judged."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from refu_core.sdf import Winding
 DEFAULT_NEAR = 0.02
 """A garment vertex this close to a place of self-contact [m] may have nowhere to go."""
 
-_OFF_SURFACE = 1e-4  # [m]; how far off its own surface a body vertex is asked whether another limb has it
+_OFF_SURFACE = 1e-4  # [m]; how far off its own surface a body vertex is tested for being in another limb
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class SelfContact:
     """Where a posed body intersects itself and its rest pose doesn't."""
 
     pairs: NDArray[np.int32]
-    """Intersecting body faces, shape (K, 2), in lexicographic order; none of a pair share an edge."""
+    """Pairs of intersecting body faces, shape (K, 2), in lexicographic order; the two never share an edge."""
     faces: NDArray[np.int32]
     """Faces of those pairs, and those buried in another limb, shape (M,), in order."""
     vertices: NDArray[np.float32]
@@ -36,14 +36,14 @@ class SelfContact:
 
     @property
     def is_free(self) -> bool:
-        """The body touches itself nowhere that it doesn't in its rest pose."""
+        """Whether the body touches itself nowhere that it doesn't in its rest pose."""
         return not len(self.faces)
 
     def near(self, points: Any, *, distance: float = DEFAULT_NEAR) -> NDArray[np.bool_]:
-        """Which of `points` [m], shape (N, 3), this contact leaves no way out; bool, shape (N,).
+        """Which of `points` [m], shape (N, 3), have no way out because of this contact; bool, shape (N,).
 
         Those within `distance` [m] of a face in contact; and, at any distance, those inside the body whose closest face
-        is in contact: to leave by a buried face is to enter another limb.
+        is in contact: leaving through a buried face would lead into another limb.
         """
         queries = as_vertices("points", points)
         if self.is_free or not len(queries):
@@ -85,7 +85,7 @@ class SelfContactDetector:
             raise MeshError(msg)
         pairs, buried = self._contacts(vertices)
         pairs = pairs[~np.isin(self._keys(pairs), self._rest_pairs)]
-        # Skin gets into another part by crossing its skin: what is buried without that is a fold that nearly touches.
+        # Skin enters another part by crossing its skin: what seems buried without that is a fold that nearly touches.
         crosses = np.zeros(len(vertices), np.bool_)
         crosses[self._faces[pairs]] = True
         buried &= ~self._rest_buried

@@ -1,4 +1,4 @@
-"""What is believed of one garment's numbers: a Kalman filter whose prior never goes away."""
+"""What is believed about one garment's numbers: a Kalman filter whose prior never goes away."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from scipy.linalg.lapack import dpotri
 
 F64 = NDArray[np.float64]
 _AT_ONCE = 1e-9
-"""Variance that comes back in a time from which on time counts [of the prior's]."""
+"""Time counts only once at least this share of the prior's variance comes back in it."""
 
 
 class Estimate:
     """A mean and a precision of D numbers that return to zero by themselves (an Ornstein–Uhlenbeck process).
 
-    Numbers are in standard deviations of the prior, whose precision so is the identity. Between frames each number
-    fades towards zero, and what is unknown of it grows towards its prior. So information is forgotten, yet nothing can
+    Numbers are in standard deviations of the prior, whose precision is therefore the identity. Between frames each
+    number fades towards zero, and its variance grows towards the prior's. So information is forgotten, yet nothing can
     drift: without measurements the prediction is left as it was, and with them every number stays within its bound.
     """
 
     def __init__(self, times: F64, bound: float) -> None:
-        """Of the times in which numbers fade to a third [s], (D,), and the bound of each."""
+        """For the times in which numbers fade to a third [s], (D,), and the bound of all numbers."""
         self._times, self._limit = times, bound
         self.reset()
 
     def reset(self) -> None:
-        """Forgets all."""
+        """Forgets everything."""
         self.mean = np.zeros_like(self._times)
         self.precision = np.eye(len(self._times))
         """The inverse of the covariance, shape (D, D)."""
         self.is_informed = False
-        """Whether anything was measured since."""
+        """Whether anything was measured since the last reset."""
 
     def wait(self, seconds: float) -> None:
         """Lets time pass."""
@@ -55,12 +55,12 @@ class Estimate:
         return np.clip(mean, -self._limit, self._limit), total
 
     def take(self, mean: F64, precision: F64) -> None:
-        """Believes this from now on."""
+        """Takes over a mean (D,) and a precision (D, D)."""
         self.mean, self.precision, self.is_informed = mean, precision, True
 
 
 def _inverse(matrix: F64) -> F64:
-    """Of a symmetric positive definite matrix (D, D), which is written over, by half the work of `inv`; symmetric."""
+    """Symmetric inverse of a symmetric positive definite matrix (D, D), by half the work of `inv`; overwrites it."""
     factor, _ = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
     found, failed = dpotri(factor, lower=True, overwrite_c=True)
     if failed:

@@ -1,4 +1,4 @@
-"""Which place of a garment each measured point is a point of."""
+"""Which place of a garment each measured point belongs to."""
 
 import warp as wp
 
@@ -20,8 +20,11 @@ def match_kernel(
     normal: wp.array[wp.vec3],
     height: wp.array[float],
 ) -> None:
-    """The closest place of the cloth within `reach`, -1 for a point that is none of its: one nearer to one of the
-    `others`, or to the skin by more than `slack`, one beyond a rim, and one on a side that the camera can't see."""
+    """The closest place of the cloth within `reach`; the face is -1 for a point that isn't the cloth's.
+
+    Such a point is nearer to one of the `others`, is nearer to the skin by more than `slack`, is beyond a rim, or is
+    closest to a face that faces away from the camera.
+    """
     i = wp.tid()
     p = points[i]
     face[i] = -1

@@ -1,4 +1,4 @@
-"""Smooth fields on a garment: what a displacement is made of that a camera may ask for."""
+"""Smooth fields on a garment, of which the displacement that a camera may ask for is made."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 
 _VERSION = 1
 _SPARE = 24
-"""Fields beyond those that are wanted: the last ones of a subspace are never good."""
+"""Fields computed beyond those that are wanted: the last ones of a subspace are never accurate."""
 _ITERATIONS = 2
 _LOWEST = 1e-3
 """Added to the Laplacian, so that it can be inverted."""
 
 
 def smooth_modes(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """The lowest fields of a garment's Laplacian, or nearly those: computed in seconds once, and then recalled.
+    """The lowest modes of a garment's Laplacian, approximately: computed in seconds once, and then cached.
 
-    Orthogonal, the smoothest first, of a mean square of one over the vertices (V, K); and wave numbers [rad/m], (K,).
+    Fields (V, K) are orthogonal, the smoothest first, and have a mean square of one over the vertices; their wave
+    numbers [rad/m], (K,), come with them.
     """
     digest = hashlib.sha256(garment.mesh.faces.tobytes()).hexdigest()[:16]
     name = f"modes-{_VERSION}-{digest}-{garment.n_vertices}-{count}"
@@ -39,7 +40,7 @@ def smooth_modes(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float
     rest = garment.v_template.detach().cpu().double().numpy()
     a, b = rest[garment.mesh.edges].transpose(1, 0, 2)
     square = float(np.median(((a - b) ** 2).sum(1)))
-    # Of a mesh of even triangles, six around a vertex, the graph's Laplacian is 3/2 edge² times the surface's.
+    # For a mesh of even triangles, six around a vertex, the graph's Laplacian is 3/2 edge² times the surface's.
     return known["fields"], np.sqrt(np.maximum(known["value"], 0) / (1.5 * square))
 
 

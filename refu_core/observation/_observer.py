@@ -27,11 +27,11 @@ class Observer:
     """Dresses one person, and brings the garments to measured points before collisions are handled.
 
     Points change a displacement made of smooth fields, within bounds. What they say is kept from frame to frame, fades,
-    and can't drift (`Estimate`). The contact stage runs after it as always, so a garment is as free of the body as
-    without points, whatever is measured. Style and shape stay as they were told: where points moved them, too, cloth
-    that isn't seen was 0.7 to 2 mm worse after 1.5 s, and what is seen no better.
+    and can't drift (`Estimate`). The contact stage runs afterwards as always, so a garment is as free of the body as
+    without points, whatever is measured. Style and shape stay as they were given: when points moved these, too, cloth
+    that isn't seen was 0.7 to 2 mm worse after 1.5 s, and cloth that is seen was no better.
 
-    One observer for each person: it remembers. A pipeline may serve several.
+    Each person needs an observer of their own, since it remembers. Several may share a pipeline.
 
     Example:
         >>> observer = Observer(pipeline)
@@ -39,7 +39,7 @@ class Observer:
     """
 
     def __init__(self, pipeline: GarmentPipeline, *, settings: ObservationSettings = DEFAULT_OBSERVATION) -> None:
-        """Prepares for the garments of a pipeline, in seconds the first time; then what was found is recalled."""
+        """Prepares for the garments of a pipeline: seconds the first time, after which the result is cached."""
         self._pipeline, self._settings = pipeline, settings
         self._cloths = {name: ObservedCloth(garment, settings) for name, garment in pipeline.garments.items()}
         body = pipeline.body
@@ -47,7 +47,7 @@ class Observer:
         self._skin_mesh = wp.Mesh(as_warp(self._skin, wp.vec3), ints(body.faces.cpu().ravel(), "cpu"))
         self._stamp_ns: int | None = None
         self.matched: dict[str, int] = {}
-        """How many places each garment was brought to in the last frame: cells of space with points of it in them."""
+        """How many places each garment was fitted to in the last frame: cells of space with points of it in them."""
 
     def reset(self) -> None:
         """Forgets what was measured."""
@@ -62,12 +62,12 @@ class Observer:
 
         Args:
             frame: as the pipeline takes it; its stamps say how much time has passed, 1/30 s where they are zero.
-            points: of the person, whatever they are points of, in the frame's axes, translation and all [m], shape
-                (N, 3); None where nothing was measured: what was learnt serves, and fades.
-            eye: where the camera is in the same axes [m], shape (3,): cloth that looks away from it isn't matched.
+            points: measured on the person, whatever they lie on, in the frame's axes, with its translation [m], shape
+                (N, 3); None if nothing was measured: what was learnt is used, and fades.
+            eye: where the camera is in the same axes [m], shape (3,): cloth that faces away from it isn't matched.
 
         Raises:
-            FrameError: points or eye of another shape, or not finite. What was learnt stays.
+            FrameError: points or eye of another shape, or not finite. What was learnt is kept.
             RefuError: as the pipeline does.
         """
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
@@ -106,7 +106,7 @@ class Observer:
                 continue
             weights = self._pipeline.garments[name].weights
             blends[name] = blend_transforms(weights, dressed.transforms).rotation[0].cpu().numpy()
-            if seen is not None:  # all, before any is matched: they compete for the points
+            if seen is not None:  # all are placed before any is matched: they compete for the points
                 cloth.place(drapes[name].vertices[0].cpu().numpy() + _posed(blends[name], cloth.offset))
         for name, blend in blends.items():
             cloth, drape = self._cloths[name], drapes[name]
@@ -120,7 +120,7 @@ class Observer:
         return dressed._replace(drapes=drapes)
 
     def _near(self, dressed: Dressed, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Those of the points (N, 3) that may be of a garment: a picture has more than the person, at any distance."""
+        """The points (N, 3) that may be on a garment: a picture shows more than the person, at any distance."""
         every = [drape.vertices[0].cpu().numpy() for drape in dressed.drapes.values()]
         reach = self._settings.reach + self._settings.bound * self._settings.amplitude
         low, high = np.min([v.min(0) for v in every], 0) - reach, np.max([v.max(0) for v in every], 0) + reach
@@ -135,7 +135,7 @@ class Observer:
         eye: NDArray[np.float64] | None,
         name: str,
     ) -> None:
-        """Brings the numbers of a garment that is in its place to what is seen."""
+        """Fits the numbers of a garment, which has been placed, to what is seen."""
         how, estimate = self._settings, cloth.estimate
         numbers, after = estimate.mean, estimate.precision
         for round_ in range(1 if estimate.is_informed else how.first_rounds):
@@ -155,13 +155,13 @@ class Observer:
 
 
 def _posed(blend: NDArray[np.float32], offset: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What displacements (V, 3) [m] are once they are posed by the joints' blend (V, 3, 3)."""
+    """Displacements (V, 3) [m] after they are posed by the joints' blended rotations (V, 3, 3)."""
     moved: NDArray[np.float32] = np.einsum("vij,vj->vi", blend, offset)
     return moved
 
 
 def _to_root(turn: RootTurn, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of a turn, of points (N, 3) [m]."""
+    """Points (N, 3) [m] after the inverse of a turn: as the root sees them."""
     rotation, shift = turn.rotation.cpu().double().numpy(), turn.shift.cpu().double().numpy()
     seen: NDArray[np.float64] = (points - shift) @ rotation
     return seen

@@ -1,4 +1,4 @@
-"""Every tuned number of fitting to what a camera sees."""
+"""Every tuned number for fitting garments to what a camera sees."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ class ObservationSettings:
     """
 
     modes: int = 192
-    """Smooth fields of the displacement along the normal, at most."""
+    """Most smooth fields that make up the displacement along the normal."""
     finest: float = 55.0
     """Their largest wave number [rad/m]: waves of 11 cm. A small garment has fewer fields."""
     amplitude: float = 0.009
     """Standard deviation of that displacement [m]: the networks' errors along the normal."""
     wave: float = 30.0
-    """Wave number up to which fields are as large as the widest [rad/m]: waves of 20 cm. Shorter ones are smaller by
-    its square."""
+    """Wave number up to which fields are about as large as the widest [rad/m]: waves of 20 cm. Beyond, their size falls
+    with its square."""
     bound: float = 3.0
-    """Each number stays within so many of its standard deviations, whatever is measured."""
+    """Each number stays within this many of its standard deviations, whatever is measured."""
     noise: float = 0.003
     """Standard deviation of a cell's point along the normal, and of what the fields can't follow [m]."""
     enough: float = 2.0
-    """A cell of space with so many points says half as much as one with very many: what the fields can't follow is
-    alike in neighbours, and isn't less for many."""
+    """A cell of space with this many points counts half as much as one with very many: what the fields can't follow is
+    alike in neighbouring points, so more of them don't average it out."""
     cell: float = 0.035
-    """Edge of a cell, whose points are taken for one, their mean [m]."""
+    """Edge of a cell, whose points are replaced by their mean [m]."""
     reach: float = 0.04
-    """Points farther from the cloth than this are none of its [m]."""
+    """Points farther from the cloth than this aren't matched to it [m]."""
     slack: float = 0.01
-    """A point may be so much nearer to the skin than to the cloth and still be the cloth's [m]."""
+    """A point may be this much nearer to the skin than to the cloth and still be the cloth's [m]."""
     robust: float = 0.015
-    """Height off the cloth from which on a point counts less and less [m] (Cauchy)."""
+    """Height off the cloth above which a point counts less and less [m] (Cauchy)."""
     first_rounds: int = 2
-    """How often the first points are matched. Later ones are once: the cloth is where the last ones have brought it."""
+    """How often the first points are matched; later ones once, since the last ones brought the cloth near."""
     most_points: int = 6000
     """More points than this are thinned out evenly."""
     remembered: float = 0.5

@@ -1,4 +1,4 @@
-"""What robots and planners ask of dressed people, besides meshes; nothing of it is computed unless it is asked for."""
+"""What robots and planners need to know of dressed people besides meshes; each part is computed only on request."""
 
 from refu_core.outputs._clearance import REACH as REACH
 from refu_core.outputs._clearance import Clearance as Clearance

@@ -1,4 +1,4 @@
-"""How far cloth is from the body that it was brought off."""
+"""How far cloth is from the body after it was moved off it."""
 
 from __future__ import annotations
 
@@ -26,37 +26,38 @@ REACH = 0.02
 class Clearance:
     """Signed distances of garments to the collider, exact where they matter.
 
-    A pipeline's own distances are those before its pushes, approximate in its default mode. So this asks anew, but only
-    where it matters, as the accurate mode does (`BandSdf`): the rest of a garment is told by its edges to be outside.
+    A pipeline's own distances are from before its pushes, and approximate in its default mode. So they are computed
+    anew here, but only where they matter, as in the accurate mode (`BandSdf`): a garment's edges tell that the rest of
+    it is outside.
     """
 
     reach = REACH
 
     def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
-        """For garments on a body; all is on the CPU, where a pipeline's outputs are."""
+        """For garments on a body. Everything is on the CPU, where a pipeline's outputs are."""
         self._sdf = BandSdf(body.faces.cpu(), band=self.reach, rest=body.v_template.detach().cpu())
         self._rings = {name: garment.mesh.ring for name, garment in garments.items()}
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> Clearance:
-        """For what a pipeline puts out."""
+        """For the outputs of a pipeline."""
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> dict[str, NDArray[np.float32]]:
-        """Of each garment in a pipeline's output: as `of_garment`, by name."""
+        """The distances of each garment in a pipeline's output, by name, as from `of_garment`."""
         require_worn(output, self._rings)
         self.update(output.body)
         return {name: self.of_garment(name, garment.local) for name, garment in output.items()}
 
     def update(self, body: Any) -> None:
-        """Takes over a posed collider, vertices (V, 3) [m]. Raises `MeshError` for what is none."""
+        """Takes over a posed collider's vertices (V, 3) [m]. Raises `MeshError` for anything else."""
         self._sdf.update(torch.from_numpy(as_points("the body's vertices", body, dtype=np.float32)))
 
     def of_garment(self, name: str, vertices: Any) -> NDArray[np.float32]:
         """Distance of a garment's vertices (V, 3) [m] to the collider, negative inside [m], shape (V,).
 
-        Exact inside and up to `reach`; farther out it is `reach`, which the vertex is at least away. Raises `MeshError`
-        for an unknown garment, for what aren't its vertices, and where `update` was given no body yet.
+        Exact inside and up to `reach`; a vertex farther out gets `reach`. Raises `MeshError` for an unknown garment,
+        for an array that can't be its vertices, and if `update` was given no body yet.
         """
         require_known(name, self._rings)
         ring = self._rings[name]

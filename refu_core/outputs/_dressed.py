@@ -1,4 +1,4 @@
-"""A dressed person in the axes that somebody wants, each part computed when it is asked for."""
+"""A dressed person in any axes that are wanted, each part computed when it is asked for."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Fittings:
-    """What is found once of a pipeline's garments and its body, when it is asked for first."""
+    """What is computed once for a pipeline's garments and its body, when it is first asked for."""
 
     def __init__(self, pipeline: GarmentPipeline, *, weights: str | os.PathLike[str] | None = None) -> None:
         """For a pipeline, and the folder of weights that it was loaded with, if any."""
@@ -35,7 +35,7 @@ class Fittings:
         self.garments = pipeline.garments
         self.names = tuple(self.garments)
         self.faces = {name: garment.faces.cpu().numpy() for name, garment in self.garments.items()}
-        """Of each garment, shape (F, 3)."""
+        """Faces of each garment, shape (F, 3)."""
         self.counts = {name: garment.n_vertices for name, garment in self.garments.items()}
         """Vertices of each garment."""
         self.colors = {name: (*garment.card.color, 1.0) for name, garment in self.garments.items()}
@@ -44,31 +44,31 @@ class Fittings:
         self._planners: dict[str, PlannerMesh] = {}
         self._preparing: dict[str, threading.Thread] = {}
         self.without_planner: dict[str, str] = {}
-        """Garments that planners can't have, and why."""
+        """Garments for which no planner's mesh could be made, and why."""
 
     def prepare(self) -> Fittings:
-        """Finds at once what it would be asked for with the first frame, but planners' meshes: they take too long."""
+        """Computes now what the first frame would need, except planners' meshes, which take too long."""
         _ = self.openings, self.normals, self.clearance, self.contacts, self.sigma
         return self
 
     @cached_property
     def openings(self) -> dict[str, Openings]:
-        """Of each garment."""
+        """The openings of each garment."""
         return {name: Openings(garment) for name, garment in self.garments.items()}
 
     @cached_property
     def normals(self) -> dict[str, VertexNormals]:
-        """Of each garment."""
+        """What computes the normals of each garment."""
         return {name: VertexNormals(faces, self.counts[name]) for name, faces in self.faces.items()}
 
     def planner(self, name: str) -> PlannerMesh:
-        """A garment's; takes ten seconds or so when it is made for the first time ever."""
+        """A garment's mesh for planners; takes ten seconds or so when it is made for the first time ever."""
         if name not in self._planners:
             self._planners[name] = PlannerMesh.of(self._pipeline, name)
         return self._planners[name]
 
     def has_planner(self, name: str) -> bool:
-        """Whether `planner` would answer at once. Who asks first starts to make it, in a thread of its own."""
+        """Whether `planner` would answer at once. The first call starts to make the mesh, in a thread of its own."""
         if name not in self._preparing:
             self._preparing[name] = threading.Thread(target=self._prepare_planner, args=(name,), daemon=True)
             self._preparing[name].start()
@@ -77,22 +77,22 @@ class Fittings:
     def _prepare_planner(self, name: str) -> None:
         try:
             self.planner(name)
-        except Exception as error:  # whatever it is: nobody else would say it, and others would wait for this garment
+        except Exception as error:  # of any kind: nothing else would report it, and callers would wait for this garment
             self.without_planner[name] = str(error) or type(error).__name__
 
     @cached_property
     def clearance(self) -> Clearance:
-        """Of all garments."""
+        """What computes the clearance of all garments."""
         return Clearance.of(self._pipeline)
 
     @cached_property
     def contacts(self) -> LimbContacts:
-        """Of the body's parts through all garments."""
+        """What finds contacts of the body's parts through all garments."""
         return LimbContacts.of(self._pipeline)
 
     @cached_property
     def sigma(self) -> Sigma:
-        """Of all garments."""
+        """What computes σ of all garments."""
         return Sigma(self._pipeline, folder=self._weights)
 
 
@@ -100,7 +100,7 @@ class Fittings:
 class DressedPerson:
     """One person in one frame; vertices are relative to `offset`, in the axes that `rotation` leads to.
 
-    One thread at a time may ask those of one `fittings`.
+    Only one thread at a time may use the people who share one `fittings`.
     """
 
     person: str
@@ -112,21 +112,21 @@ class DressedPerson:
     offset: NDArray[np.float64]
     """Where the body's own origin is [m], shape (3,); float64, so that a body far away loses no precision."""
     camera: PinholeCamera | None = None
-    """Who looks, where somebody does; in the axes and from the origin that `offset` is in."""
+    """The camera that sees the person, if any; its axes and origin are those of `offset`."""
 
     @property
     def stamp_ns(self) -> int:
-        """Of the frame [ns]."""
+        """The frame's time stamp [ns]."""
         return self.frame.stamp_ns
 
     def turned(self, points: NDArray[Any]) -> NDArray[Any]:
-        """Points relative to the body's own origin in SMPL's axes, (..., 3), in those that `rotation` leads to."""
+        """Turns points (..., 3) that are relative to the body's origin from SMPL's axes into those of `rotation`."""
         turned: NDArray[Any] = points @ self.rotation.T.astype(points.dtype)
         return turned
 
     @cached_property
     def vertices(self) -> dict[str, NDArray[np.float32]]:
-        """Of each garment [m], shape (V, 3)."""
+        """Vertices of each garment [m], shape (V, 3)."""
         return {name: self.turned(mesh.local) for name, mesh in self.output.items()}
 
     @cached_property
@@ -136,11 +136,11 @@ class DressedPerson:
 
     @cached_property
     def openings(self) -> dict[str, tuple[Opening, ...]]:
-        """Of each garment."""
+        """The openings of each garment in this frame."""
         return {name: self.fittings.openings[name].frames(points) for name, points in self.vertices.items()}
 
     def normals(self) -> list[NDArray[np.float32]]:
-        """At the vertices of each garment, shape (V, 3)."""
+        """Normals at the vertices of each garment, shape (V, 3)."""
         return [self.fittings.normals[name](points) for name, points in self.vertices.items()]
 
     def clearance(self) -> list[NDArray[np.float32]]:

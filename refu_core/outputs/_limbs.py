@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 PRESSED = DEFAULT_GAP + 0.003
-"""Cloth is pressed where the skins on both sides of it are this near to each other [m]: the room that the collider
-leaves between two parts, and what the two ways to them are longer than the straight one."""
+"""Cloth is pressed if its distances to the skins on both sides add up to less than this [m]: the room that the collider
+leaves between two parts, and some more since the two ways together are longer than the straight one."""
 _OPPOSED = -0.5
 """Cosine of two skins' normals below which they face each other."""
 _PARTS = tuple(SEGMENTS)
@@ -35,12 +35,12 @@ class LimbContact:
     """Cloth between two parts of the body that touch."""
 
     parts: tuple[str, str]
-    """Their names, as `refu_core.body.SEGMENTS` has them."""
+    """Their names, as in `refu_core.body.SEGMENTS`."""
     area: float
-    """Of the cloth between them, all garments together [m²]."""
+    """Area of the cloth between them, all garments together [m²]."""
     depth: float
-    """How far the two would be in each other at most, had neither given way: what of them flesh and cloth have to take
-    up [m]; 0 where they touch without pressing."""
+    """Greatest depth to which the two would overlap, had neither given way [m]: what flesh and cloth have to take up.
+    0 where they touch without pressing."""
     mean_depth: float
     """The same on average over the area [m]."""
     centre: NDArray[np.float64]
@@ -48,9 +48,9 @@ class LimbContact:
 
 
 class LimbContacts:
-    """Finds the cloth that is pressed between parts of a body, by what the collider had to give way.
+    """Finds the cloth that is pressed between parts of a body, by how far the collider had to give way.
 
-    It is geometry alone: nothing in it knows how stiff cloth or flesh is, so no force can be had from it.
+    This is geometry alone: it doesn't know how stiff cloth or flesh is, so it can't give a force.
     """
 
     def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
@@ -74,13 +74,13 @@ class LimbContacts:
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> LimbContacts:
-        """For what a pipeline puts out."""
+        """For the outputs of a pipeline."""
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:
-        """The contacts in the output of the pipeline, that of the largest area first.
+        """The contacts in an output of the pipeline, the one of the largest area first.
 
-        Raises `MeshError` for what is no output, or one of other garments.
+        Raises `MeshError` for anything but an output, and for an output with other garments.
         """
         require_worn(output, self._faces)
         body = output.body
@@ -100,7 +100,7 @@ class LimbContacts:
     def _pressed(
         self, points: NDArray[np.float32], faces: NDArray[np.int64]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """Of the vertices that are pressed: the pair, (M,), and area, depth and place, (M, 5)."""
+        """For the vertices that are pressed: the pair of parts, (M,), and area, depth and place, (M, 5)."""
         n = len(points)
         pair, depth = np.empty(n, np.int32), np.empty(n, np.float32)
         wp.launch(

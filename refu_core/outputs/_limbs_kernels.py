@@ -11,7 +11,7 @@ class Parts:
     face_start: wp.array[wp.int32]
     """Where each part's faces begin in `face`, shape (P + 1,)."""
     face: wp.array[wp.int32]
-    """Three vertices of each face, of all parts one after another."""
+    """Three vertices of each face, for all parts one after another."""
     low: wp.array[wp.vec3]
     high: wp.array[wp.vec3]
     """Corners of each part's box [m]."""
@@ -23,7 +23,7 @@ class Parts:
 
 @wp.kernel(enable_backward=False)
 def box_kernel(parts: Parts) -> None:
-    """The boxes of parts, in the body's pose."""
+    """The bounding box of each part, in the body's pose."""
     k = wp.tid()
     low, high = wp.vec3(1.0e9), wp.vec3(-1.0e9)
     for i in range(3 * parts.face_start[k], 3 * parts.face_start[k + 1]):
@@ -47,7 +47,7 @@ class Beside:
 
 @wp.func
 def beside(p: wp.vec3, parts: Parts, within: float, other: int, facing: wp.vec3, opposed: float) -> Beside:
-    """The nearest part but `other`, whose skin there faces the direction `facing`."""
+    """The nearest part except `other` whose skin there faces against `facing`; the nearest of all if `other` is -1."""
     found = Beside()
     found.part = -1
     found.distance = within
@@ -85,8 +85,10 @@ def pressed_kernel(
     pair: wp.array[wp.int32],
     depth: wp.array[float],
 ) -> None:
-    """The pair of parts, lower times P plus higher, whose skins face each other on both sides of a vertex, together
-    `within` reach, -1 for none; and how far these two were in each other before they were pulled apart."""
+    """The pair of parts, lower times P plus higher, whose skins face each other on both sides of a vertex; -1 for none.
+
+    The distances to both add up to less than `within`. `depth` is how far the two overlapped before they were parted.
+    """
     i = wp.tid()
     p = points[i]
     pair[i] = -1
@@ -97,5 +99,5 @@ def pressed_kernel(
     second = beside(p, parts, within - first.distance, first.part, first.normal, opposed)
     if second.part >= 0:
         pair[i] = wp.min(first.part, second.part) * parts.mesh.shape[0] + wp.max(first.part, second.part)
-        # What there is room for now they needn't have been in each other for.
+        # They overlapped by as much as they gave way, less the room that is between them now.
         depth[i] = wp.max(first.gave + second.gave - first.distance - second.distance, 0.0)

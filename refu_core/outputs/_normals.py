@@ -25,15 +25,15 @@ class VertexNormals:
         self._corners = np.ascontiguousarray(checked.T, dtype=np.intp)
         ones, owner = np.ones(checked.size, np.float32), np.repeat(np.arange(n), 3)
         self._sum = sparse.csr_array((ones, (checked.ravel(), owner)), shape=(n_vertices, n))
-        # Coordinate after coordinate, in memory that is there already: no pass allocates.
+        # Coordinate by coordinate, in memory that is allocated once: no pass allocates any.
         self._points = np.empty((3, 3, n), np.float32)
         self._product = np.empty(n, np.float32)
         self._areas = np.empty((n, 3), np.float32)
 
     def __call__(self, vertices: ArrayLike) -> NDArray[np.float32]:
-        """Unit normals at finite vertices (V, 3), of that shape, in their axes; zero where no face has an area.
+        """Unit normals (V, 3) at finite vertices (V, 3), in their axes; zero where no face has an area.
 
-        The mean of the faces around each vertex, by area. Raises `MeshError` for vertices of another shape.
+        The mean of the normals of the faces around, weighted by area. Raises `MeshError` for vertices of another shape.
         """
         columns = np.ascontiguousarray(np.asarray(vertices, np.float32).T)
         if columns.shape != (3, self._n_vertices):

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from refu_core.garments import GarmentTemplate
 
 _FLAT = 0.1
-"""A ring whose area is below this share of that of a circle as long is drawn together: which way it faces is then said
-more and more by the cloth beside it."""
+"""A ring with less than this share of the area of a circle of the same length is drawn together. Its direction is then
+taken more and more from the cloth beside it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +28,10 @@ class Opening:
     """`neck`, `left_sleeve`, `right_sleeve`, `waist`, `hem`, `left_leg`, `right_leg`, `front` (between the edges of a
     coat that is open), or `opening_0`, …"""
     centre: NDArray[np.float64]
-    """Of the rim [m], shape (3,)."""
+    """Centre of the rim [m], shape (3,)."""
     rotation: NDArray[np.float64]
     """Columns are the frame's x, y and z, shape (3, 3): z points out of the garment, through the opening. In the rest
-    pose x points to the wearer's left, and that of a sleeve to the front; it then goes with the cloth."""
+    pose x points to the wearer's left, or for a sleeve to the front; from there it moves with the cloth."""
     width: float
     """Extent of the rim along x [m]."""
     height: float
@@ -44,21 +44,21 @@ class Opening:
 
 
 class Openings:
-    """The openings of one garment, found once from its boundary; a frame of them costs a fraction of a millisecond.
+    """The openings of one garment, found once from its boundary; a frame then takes a fraction of a millisecond.
 
-    Each is known by geometry and skinning weights, whatever the garment is called: a sleeve is moved by an arm and
+    Each is recognised by geometry and skinning weights, whatever the garment is called: a sleeve is moved by an arm and
     opens away from the trunk. The boundary of an open coat is one loop, which is cut into neck, hem and front.
 
     Centre and x are linear in the rim's vertices, with weights from the rest pose, so they are as steady as the cloth.
     """
 
     def __init__(self, garment: GarmentTemplate) -> None:
-        """For any garment of the project's or of one's own; one without a boundary has no openings."""
+        """For any garment, the project's or a user's own; one without a boundary has no openings."""
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
         rings = rings_of(garment)
         self.names: tuple[str, ...] = tuple(rings)
-        """Of the openings, in the order of `frames`."""
+        """Names of the openings, in the order of `frames`."""
         self._rings = [(name, ring, _along(ring, rest)) for name, ring in rings.items()]
 
     def frames(self, vertices: Any) -> tuple[Opening, ...]:
@@ -71,7 +71,7 @@ class Openings:
 
 
 def _along(ring: Ring, rest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights (K,) of the rim's vertices whose sum is the opening's x in the rest pose, and goes with the cloth."""
+    """Weights (K,) with which the rim's vertices add up to the opening's x, in the rest pose and as the cloth moves."""
     points = rest[ring.vertices]
     area = newell(points)
     normal = area / max(float(np.linalg.norm(area)), 1e-12)

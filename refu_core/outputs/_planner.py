@@ -1,4 +1,4 @@
-"""A garment as planners take obstacles: few triangles, closed, and as thick as is said."""
+"""A garment as planners take obstacles: few triangles, closed, and of a given thickness."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from refu_core.realtime import GarmentPipeline
 
 HALF_THICKNESS = 0.005
-"""How far either side of the solid is from the middle of the cloth [m]: about as far as the coarse cloth may be from
-the garment, which so lies within the solid nearly everywhere."""
+"""How far each side of the solid is from the middle of the cloth [m]. The coarse cloth may be about this far from the
+garment, so the garment lies within the solid nearly everywhere."""
 MAX_TRIANGLES = 2000
 _LEAST_TRIANGLES = 100
 _VERSION = 3
-"""Of what is recalled: another one is computed anew."""
+"""Version of what is cached; a result of any other version is computed anew."""
 _POSES = {
     "T-pose": "",
     "stands": "left_shoulder 0 0 -1.15, right_shoulder 0 0 1.15",
@@ -50,18 +50,18 @@ _POSES = {
     "sits": "left_hip -1.5 0 0.15, right_hip -1.5 0 -0.1, left_knee 1.5 0 0, right_knee 1.4 0 0, "
     "left_shoulder 0.2 -0.2 -1.2, right_shoulder 0.2 0.4 1.1, right_elbow 0 1.2 0",
 }
-"""What people do that a planner's mesh has to fit in: joints and their rotation vectors [rad]."""
+"""Poses in which a planner's mesh has to fit: joints and their rotation vectors [rad]."""
 Worn = NDArray[np.float64]
 
 
 class PlannerMesh:
-    """A coarse, closed copy of one garment, decimated once; a frame of it is one sparse product.
+    """A coarse, closed copy of one garment, decimated once; each frame then takes one sparse product.
 
-    The cloth becomes a sheet of about half the triangles. Which ones, and of which vertices of the garment its vertices
-    are means, is found on a number of poses, so that it is near the cloth in all of them. Its two sides lie
-    `half_thickness` off the sheet, with a wall along every rim.
+    The cloth becomes a sheet of about half the triangles. Its vertices are weighted means of the garment's; both
+    these and its triangles are found from several poses, so that it is near the cloth in all of them. The solid's two
+    sides lie `half_thickness` off the sheet, with a wall along every rim.
 
-    A solid around the cloth reaches into the body that wears it: planners are to allow these two to touch.
+    A solid around the cloth reaches into the body that wears it, so planners must allow these two to touch.
     """
 
     def __init__(
@@ -72,12 +72,12 @@ class PlannerMesh:
         half_thickness: float = HALF_THICKNESS,
         worn: Callable[[], Worn] | None = None,
     ) -> None:
-        """Prepares for a garment, in some seconds the first time; then what was found is recalled (`REFU_CACHE`).
+        """Prepares for a garment: some seconds the first time, after which the result is cached (`REFU_CACHE`).
 
         The solid has `max_triangles` at most, and its sides are `half_thickness` [m] from the middle of the cloth.
-        `worn` gives the garment as it is worn in several poses [m], (P, V, 3), where nothing is recalled; without, the
-        rest pose has to do. Raises `MeshError` for fewer than 100 triangles, no thickness, and where a garment can't be
-        drawn so coarse.
+        `worn` returns the garment as it is worn in several poses [m], (P, V, 3), and is called if nothing is cached;
+        without it only the rest pose is used. Raises `MeshError` for fewer than 100 triangles, for no thickness, and if
+        a garment can't be made that coarse.
         """
         if max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
             msg = (
@@ -110,7 +110,7 @@ class PlannerMesh:
         *,
         half_thickness: float = HALF_THICKNESS,
     ) -> PlannerMesh:
-        """For a pipeline's garment of this name, which it dresses in ten poses the first time.
+        """For a pipeline's garment of this name, which the pipeline drapes in ten poses the first time.
 
         Raises `MeshError` as the constructor does, and where the pipeline has no such garment.
         """
@@ -121,15 +121,15 @@ class PlannerMesh:
         return cls(template, max_triangles, half_thickness=half_thickness, worn=lambda: _practised(pipeline, garment))
 
     def middle(self, vertices: Any) -> NDArray[np.float64]:
-        """The sheet in the middle of the solid [m], as `solid`, shape (N / 2, 3)."""
+        """The sheet in the middle of the solid [m], shape (N / 2, 3), for `vertices` as `solid` takes them."""
         points = as_points("the garment's vertices", vertices, self._n_vertices)
         sheet: NDArray[np.float64] = self._take @ points
         return sheet
 
     def solid(self, vertices: Any) -> NDArray[np.float64]:
-        """Vertices of the solid for `faces` [m], shape (N, 3), of a garment's `vertices` (V, 3) [m].
+        """Vertices of the solid [m], shape (N, 3), to go with `faces`, for a garment's `vertices` (V, 3) [m].
 
-        Axes are any right-handed ones. Raises `MeshError` for anything but finite numbers of that shape.
+        Any right-handed axes will do. Raises `MeshError` for anything but finite numbers of that shape.
         """
         middle = self.middle(vertices)
         a, b, c = middle[self.sheet].transpose(1, 0, 2)
@@ -145,7 +145,7 @@ class PlannerMesh:
 def _prepared(
     garment: GarmentTemplate, rest: NDArray[np.float64], max_triangles: int, worn: Callable[[], Worn] | None
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], csr_array]:
-    """The vertices that are kept, the sheet's faces and its weights; computed once for a garment, and then recalled."""
+    """The vertices that are kept, the sheet's faces and its weights; computed once for a garment, and then cached."""
     digest = hashlib.sha256(rest.astype(np.float32).tobytes() + garment.mesh.faces.tobytes()).hexdigest()[:16]
     name = f"planner-{_VERSION}-{digest}-{max_triangles}{'-worn' if worn else ''}"
     keys = ("kept", "sheet", "weight", "column", "start")
@@ -161,7 +161,7 @@ def _prepared(
 
 
 def _solid(sheet: NDArray[np.int32], n: int) -> NDArray[np.int32]:
-    """Both sides of a sheet of n vertices, and walls along its rims."""
+    """The faces of both sides of a sheet of n vertices, and of walls along its rims."""
     on_rim = rim_of(sheet)
     a, b = sheet[on_rim], np.roll(sheet, -1, axis=1)[on_rim]
     walls = np.concatenate((np.stack((b, a, a + n), 1), np.stack((b, a + n, b + n), 1)))
@@ -169,12 +169,12 @@ def _solid(sheet: NDArray[np.int32], n: int) -> NDArray[np.int32]:
 
 
 def _practised(pipeline: GarmentPipeline, garment: str) -> NDArray[np.float64]:
-    """A pipeline's garment as it is worn while somebody does these things [m], shape (P, V, 3)."""
+    """A pipeline's garment as it is worn in each of `_POSES` [m], shape (P, V, 3)."""
     worn = []
     for turns in _POSES.values():
         pose = np.zeros((N_JOINTS, 3))
         for joint, *turn in map(str.split, filter(None, turns.split(", "))):
             pose[JOINT_NAMES.index(joint)] = [float(number) for number in turn]
-        # Not by calling it, whose last result is remembered for whoever asks the same again.
+        # Not by calling the pipeline: it keeps its last outputs for callers that ask for the same frames again.
         worn.append(pipeline.adjusted(SmplFrame(pose=pose.astype(np.float32)), lambda dressed: dressed)[garment].local)
     return np.stack(worn).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Where the vertices of a coarse sheet go, as means of a garment's, so that it is near the cloth in many shapes."""
+"""Makes a coarse sheet's vertices weighted means of a garment's, so that it is near the cloth in many shapes."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from refu_core.mesh import Connectivity, vertex_areas
 
 Points = NDArray[np.float64]
 _LEAST_WEIGHT = 0.01
-"""A vertex counts less than this for a coarse one: it is left out."""
+"""A vertex with a smaller weight than this in a coarse one is left out."""
 _OWN = 0.5
-"""How much of a coarse vertex is the garment's own before it is fitted, the rest being the fit of the rest pose, which
-overshoots where cloth folds."""
+"""Share of the garment's own kept vertex in a coarse vertex before fitting. The rest comes from the fit of the rest
+pose, which overshoots where cloth folds."""
 _FIRM = 1e-3
-"""How much that fit is held together where hardly any cloth tells of it."""
+"""How firmly that fit is held to the kept vertices where hardly any cloth determines it."""
 _ROUNDS = 2
-"""How often shapes are fitted, and then the weights to all of them."""
+"""How often the shapes are fitted, and after them the weights to all shapes."""
 _STEPS = 3
 _TETHER = 0.1
-"""How much a shape's fit stays where it was, and in one piece, in each of the steps."""
+"""How firmly each step keeps a shape's fit where it was, and in one piece."""
 _RIDGE = 1e-3
-"""How much weights stay what they were [m²]: there are more of them than shapes say."""
+"""How firmly weights are kept as they were [m²]: there are more of them than the shapes determine."""
 _PER_EDGE = 3
-"""A triangle of the sheet is asked about at the corners of nine smaller ones."""
+"""Parts of an edge: each triangle of the sheet is sampled at the corners of nine smaller ones."""
 _TOUCHING = 5e-4
-"""Distances below it count alike [m]."""
+"""Distances below this count as this [m]."""
 
 
 def fitted_means(shapes: Points, mesh: Connectivity, kept: NDArray[np.intp], sheet: NDArray[np.int32]) -> csr_array:
-    """The weights (K, V), rows of which sum to one, that take a garment to the sheet near it.
+    """The weights (K, V), whose rows sum to one, that take a garment to the sheet near it.
 
-    In each shape (P, V, 3) [m], the first of which is the rest pose, the sheet is drawn to the cloth and to where the
-    cloth is far from it (ICP in both directions, farther places counting more). The weights are then those that do so
-    for all of them, by ridge regression among a coarse vertex's own neighbourhood.
+    In each of the shapes (P, V, 3) [m], the first of which is the rest pose, the sheet is drawn to the cloth by ICP in
+    both directions, in which places that are farther off count more. Ridge regression then finds the weights that best
+    do this for all shapes, within each coarse vertex's own neighbourhood.
     """
     take = _means(shapes[0], mesh, kept, sheet)
     if len(kept) == shapes.shape[1]:
@@ -51,7 +51,7 @@ def fitted_means(shapes: Points, mesh: Connectivity, kept: NDArray[np.intp], she
 
 
 def _means(rest: Points, mesh: Connectivity, kept: NDArray[np.intp], sheet: NDArray[np.int32]) -> csr_array:
-    """Half-way between the kept vertices and the least squares of the rest pose."""
+    """Weights half-way between those of the kept vertices and the least-squares fit of the rest pose."""
     own = csr_array((np.ones(len(kept)), (np.arange(len(kept)), kept)), shape=(len(kept), len(rest)))
     if len(kept) == len(rest):
         return own
@@ -66,7 +66,7 @@ def _means(rest: Points, mesh: Connectivity, kept: NDArray[np.intp], sheet: NDAr
 
 
 def _placed(surface: Surface, points: Points) -> csr_array:
-    """What takes the surface's vertices to the places closest to points, shape (N, K)."""
+    """The matrix that takes a surface's vertices to its places closest to points, shape (N, K)."""
     found = surface.closest(points)
     ends = 3 * np.arange(len(points) + 1)
     shape = len(points), len(surface.vertices)
@@ -74,7 +74,7 @@ def _placed(surface: Surface, points: Points) -> csr_array:
 
 
 def _samples(sheet: NDArray[np.int32], n: int) -> csr_array:
-    """What takes the sheet's n vertices to places spread over its triangles."""
+    """The matrix that takes the sheet's n vertices to places spread over its triangles."""
     steps = range(_PER_EDGE + 1)
     inner = [(i, j, _PER_EDGE - i - j) for i, j in product(steps, steps) if i + j <= _PER_EDGE]
     weights = np.tile(np.array(inner) / _PER_EDGE, (len(sheet), 1))
@@ -100,13 +100,13 @@ def _drawn(sheet_points: Points, sheet: NDArray[np.int32], cloth: Points, faces:
 
 
 def _distance(way: Points) -> Points:
-    """Lengths (N,) of vectors [m], which differences are weighted with."""
+    """Lengths (N,) of vectors [m], at least `_TOUCHING`: the weights of differences."""
     length: Points = np.maximum(np.linalg.norm(way, axis=1), _TOUCHING)
     return length
 
 
 def _regress(take: csr_array, shapes: Points, goals: Points) -> None:
-    """Changes the weights that a coarse vertex has of its neighbourhood so that it goes where it is wanted."""
+    """Changes each coarse vertex's weights in its neighbourhood so that it comes close to its goals in all shapes."""
     for k in range(take.shape[0]):
         of = slice(take.indptr[k], take.indptr[k + 1])
         near = shapes[:, take.indices[of]]

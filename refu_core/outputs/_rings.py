@@ -21,17 +21,17 @@ NAMES = ("neck", "left_sleeve", "right_sleeve", "waist", "hem", "left_leg", "rig
 LEAST_PERIMETER = 0.08
 """A shorter loop is a button hole or a flaw of the mesh [m]: no wrist goes through it."""
 _LEAST_ARC = 0.15
-"""A loop that runs along more than this of an upper and of a lower rim is cut into both [m]: the boundary of a coat
+"""A loop with at least this length of both an upper and a lower rim is cut into these [m]: it is the boundary of a coat
 that is open in front."""
 _WINDOW = 0.05
-"""Length over which the direction of a rim is averaged [m]: boundaries of outside meshes are stairs."""
+"""Length over which the direction of a rim is averaged [m]: boundaries of imported meshes may be stepped."""
 _LOW = -0.5
-"""Upward part of the way out of the cloth below which a rim is a lower one: the sine of 30 degrees."""
+"""A rim is a lower one if its direction out of the cloth has an upward part below this: 30 degrees downwards."""
 _UPRIGHT = 0.8
-"""Upward part of a rim's own direction above which it is the edge of a front: a neckline is less steep."""
+"""A rim is the edge of a front if its own direction has a vertical part above this; a neckline is less steep."""
 _TOP, _SIDE, _BOTTOM = 1, 0, -1
 _UPPER = (*joints_of("head"), 9, 13, 14)
-"""Joints of what is above the chest, without the arms."""
+"""Joints of the body above the chest, without the arms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +41,14 @@ class Ring:
     vertices: NDArray[np.intp]
     """In order, counter-clockwise as seen from outside, each once, shape (K,)."""
     inner: NDArray[np.intp]
-    """The vertex across the face at the edge from each of them to the next, shape (K,); where the rim is closed by a
-    chord, that of the edge before."""
+    """The third vertex of the face at the edge from each vertex to the next, shape (K,). Where a chord closes the rim,
+    it is that of the edge that was there before."""
     shares: NDArray[np.float64]
-    """Share of the rim's length that is each vertex's, shape (K,)."""
+    """Each vertex's share of the rim's length, shape (K,)."""
 
 
 def rings_of(garment: GarmentTemplate) -> dict[str, Ring]:
-    """The openings of a garment in its rest pose by their names, in the order of `NAMES`; none of a closed one."""
+    """The openings of a garment in its rest pose by their names, in the order of `NAMES`; none for a closed one."""
     rest = garment.v_template.detach().cpu().double().numpy()
     weights = garment.weights.detach().cpu().double().numpy()
     found: list[tuple[str, float, Ring]] = []
@@ -62,7 +62,7 @@ def rings_of(garment: GarmentTemplate) -> dict[str, Ring]:
                 found.append((name, float(length.sum()), ring))
     found.sort(key=lambda one: -one[1])
     named: dict[str, Ring] = {}
-    for name, _, ring in found:  # of two that would have one name, the longer has it
+    for name, _, ring in found:  # of two that would have the same name, the longer one gets it
         if not name or name in named:
             name = f"opening_{sum(known.startswith('opening') for known in named)}"
         named[name] = ring
@@ -78,7 +78,7 @@ def newell(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Each boundary loop, against its faces, and the vertices across its edges."""
+    """Each boundary loop, against the direction of its faces, and the vertices across from its edges."""
     on_rim = rim_of(faces)
     onward: dict[int, list[tuple[int, int]]] = {}
     for a, b, c in zip(*(np.roll(faces, -k, axis=1)[on_rim].tolist() for k in range(3)), strict=True):
@@ -86,7 +86,7 @@ def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray
     while onward:
         first = vertex = next(iter(onward))
         loop, inner = [], []
-        while vertex in onward:  # a vertex where rims meet is left by another one each time
+        while vertex in onward:  # a vertex where rims meet is left along another rim each time
             following, beyond = onward[vertex].pop()
             if not onward[vertex]:
                 del onward[vertex]
@@ -100,7 +100,7 @@ def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray
 
 
 def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of the edge from each point of a closed polygon (K, 3) [m] to the next, shape (K,)."""
+    """Length of the edge from each point of a closed polygon (K, 3) [m] to the next, shape (K,)."""
     length: NDArray[np.float64] = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     return length
 
@@ -108,7 +108,7 @@ def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _parts(
     loop: NDArray[np.intp], inner: NDArray[np.intp], rest: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.intp], NDArray[np.intp], bool]]:
-    """A loop as it is; one that is an upper and a lower rim in one, cut into these and what lies between them."""
+    """A loop as it is, or, if it is an upper and a lower rim in one, these two and what lies between them."""
     points, length = rest[loop], _lengths(rest[loop])
     after = np.roll(points, -1, axis=0)
     along = (after - points) / np.maximum(length, 1e-12)[:, None]
@@ -141,7 +141,7 @@ def _longest_run(mask: NDArray[np.bool_], length: NDArray[np.float64]) -> NDArra
 
 
 def _called(ring: Ring, rest: NDArray[np.float64], weights: NDArray[np.float64]) -> str:
-    """By which joints move the rim, and where it opens to; empty where that is nothing known."""
+    """The opening's name, by the joints that move the rim and the way it opens; empty if it isn't a known one."""
     area = newell(rest[ring.vertices])
     normal = area / max(float(np.linalg.norm(area)), 1e-12)
     of_joint = ring.shares @ weights[ring.vertices]

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 UNKNOWN_SIGMA = 0.03
-"""Of every vertex of a garment whose network has no `sigma` file, or that has none and follows the skin [m]. By the
-skin alone, the T-shirt, the shirt, and the shorts are off by 24 to 27 mm a standard deviation, the skirt by 43."""
+"""σ of every vertex of a garment whose network has no `sigma` file, or that has no network and follows the skin [m].
+Following the skin alone, the T-shirt, the shirt, and the shorts have a σ of 24 to 27 mm, the skirt of 43."""
 RADIUS_90 = 2.5003
-"""A ball of so many σ around a vertex holds the true one in 90 % of cases: the quantile of χ with three degrees."""
+"""A ball of this many σ around a vertex holds the true one in 90 % of cases: χ's quantile, three degrees of freedom."""
 REGIONS = 3
-"""Pose regions: as many equal shares of the samples, from hardly bent to most bent."""
+"""Number of pose regions: equal shares of the samples, from hardly bent to most bent."""
 _SWEEPS = 10
-"""The errors of neighbours are averaged along edges so often: some fifty samples say less of one vertex than that."""
+"""How often errors are averaged with those of neighbours: some fifty samples say too little about a single vertex."""
 _FILE = "sigma"
 
 
@@ -45,28 +45,28 @@ class SigmaMap:
     """What is known of one garment's errors."""
 
     sigma: NDArray[np.float32]
-    """Standard deviation of each vertex in a coordinate, over all poses [m], shape (V,)."""
+    """Standard deviation of each vertex per coordinate, over all poses [m], shape (V,)."""
     bend: NDArray[np.float32]
     """How much the garment's joints are bent in the middle of each pose region [rad], ascending, shape (R,)."""
     factor: NDArray[np.float32]
-    """By how much σ is larger there, shape (R,)."""
+    """The factor by which σ is larger there, shape (R,)."""
     is_measured: bool = True
     """False for `UNKNOWN_SIGMA`."""
 
     def at(self, bend: float) -> NDArray[np.float32]:
-        """σ in a pose [m], shape (V,): between the regions' middles it is interpolated, so that nothing leaps."""
+        """σ in a pose bent this much [m], shape (V,), interpolated between the regions' middles to avoid jumps."""
         found: NDArray[np.float32] = self.sigma * np.float32(np.interp(bend, self.bend, self.factor))
         return found
 
     @classmethod
     def unknown(cls, n_vertices: int) -> SigmaMap:
-        """Of a garment that nothing is known of: a number that a filter can work with."""
+        """For a garment about which nothing is known: a number that a filter can work with."""
         one = np.ones(1, np.float32)
         return cls(np.full(n_vertices, UNKNOWN_SIGMA, np.float32), 0 * one, one, is_measured=False)
 
 
 def bend_of(garment: GarmentTemplate, pose: NDArray[Any]) -> NDArray[np.float64]:
-    """How much the joints that a garment feels are bent [rad], root left out, of poses (…, 24, 3) [rad]; shape (…,)."""
+    """How much the joints that affect a garment, except the root, bend [rad] in poses (…, 24, 3) [rad]; shape (…,)."""
     joints = [joint for joint in garment.card.joints if joint != 0]
     angle = np.linalg.norm(np.asarray(pose, np.float64)[..., joints, :], axis=-1)
     wrapped = np.remainder(angle + np.pi, 2 * np.pi) - np.pi  # a rotation of 350° is one of 10°
@@ -75,10 +75,10 @@ def bend_of(garment: GarmentTemplate, pose: NDArray[Any]) -> NDArray[np.float64]
 
 
 def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any]) -> SigmaMap:
-    """σ of a garment from N predictions whose truth is known, and which its network hasn't seen.
+    """σ of a garment from N predictions whose truth is known, for samples that its network hasn't seen.
 
-    `errors` are distances of predicted vertices to the true ones [m], (N, V), `poses` those of the samples [rad],
-    (N, 24, 3). In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` of it.
+    `errors` are distances of predicted vertices to the true ones [m], (N, V); `poses` are those of the samples [rad],
+    (N, 24, 3). In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` σ.
     Raises `MeshError` for arrays of other shapes, and for fewer than 10 samples a region.
     """
     length = np.asarray(errors, np.float64)
@@ -108,7 +108,7 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
 def save_sigma(
     garment: GarmentTemplate, found: SigmaMap, card: Mapping[str, Any], *, folder: str | os.PathLike[str] | None = None
 ) -> Path:
-    """Writes `sigma` beside a garment's weights, in its folder below `folder` or below those that ship.
+    """Writes `sigma` beside a garment's weights, in its folder below `folder`, by default below the shipped weights.
 
     Raises `WeightsError` where it can't be written.
     """
@@ -124,7 +124,7 @@ def save_sigma(
 def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | None = None) -> SigmaMap:
     """What `save_sigma` wrote; `SigmaMap.unknown` where there is no such file.
 
-    Raises `WeightsError` for one that is damaged, or of another garment.
+    Raises `WeightsError` for a file that is damaged, or of another garment.
     """
     stem = weights_folder(garment.name, folder) / _FILE
     if not stem.with_suffix(".json").exists():
@@ -143,17 +143,17 @@ def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | Non
 
 
 class Sigma:
-    """Standard deviations of a pipeline's garments: of its networks, and of the input where its covariance is known."""
+    """Standard deviations of a pipeline's garments: from its networks and, if its covariance is known, the input."""
 
     def __init__(self, pipeline: GarmentPipeline, *, folder: str | os.PathLike[str] | None = None) -> None:
-        """For a pipeline; `folder` is that of weights of one's own, if it was loaded with one.
+        """For a pipeline; `folder` is that of the user's own weights, if the pipeline was loaded with one.
 
         Raises `WeightsError` for a damaged file of σ.
         """
         self._body = pipeline.body
         self._garments = pipeline.garments
         self.maps: dict[str, SigmaMap] = {}
-        """By garment. One that no network drapes, or whose network nobody has measured, is `UNKNOWN_SIGMA`."""
+        """By garment. One that no network drapes, or whose network wasn't measured, has `UNKNOWN_SIGMA`."""
         for name, garment in self._garments.items():
             known = name not in pipeline.untrained
             self.maps[name] = load_sigma(garment, folder=folder) if known else SigmaMap.unknown(garment.n_vertices)
@@ -166,14 +166,14 @@ class Sigma:
         pose_covariance: NDArray[Any] | None = None,
         transl_covariance: NDArray[Any] | None = None,
     ) -> dict[str, NDArray[np.float32]]:
-        """σ of each garment's vertices in a coordinate [m], by name, shape (V,), for a frame and what was made of it.
+        """σ per coordinate of each garment's vertices [m], by name, shape (V,), for a frame and what was made of it.
 
-        A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as it says; σ is never NaN.
+        A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as stated; σ is never NaN.
         Raises `FrameError` for a covariance of another shape, not finite, too large, or with a negative variance, and
-        `MeshError` for what is no output, or one of other garments.
+        `MeshError` for anything but an output, and for an output with other garments.
 
         Args:
-            frame: that was dressed.
+            frame: the one that was dressed.
             output: what the pipeline made of it.
             pose_covariance: of the rotation vectors [rad²], shape (72, 72), or (24, 3, 3) where joints are
                 independent; it is pushed through the kinematics.
@@ -208,7 +208,7 @@ def _unseen_tilt(frame: SmplFrame) -> float:
 
 
 _LARGEST = 1e12
-"""Numbers of a covariance; joints turn by 1e4 rad at most, and people are no farther than 1e6 m off."""
+"""Largest number in a covariance; joints turn by 1e4 rad at most, and people are no farther than 1e6 m off."""
 
 
 def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
@@ -236,10 +236,10 @@ def _input_variance(
     vertices: NDArray[np.float32],
     covariance: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Variance of a garment's vertices in a coordinate, by the pose's covariance, to first order [m²], shape (V,).
+    """Variance per coordinate of a garment's vertices due to the pose's covariance, to first order [m²], shape (V,).
 
-    A joint turns what hangs on it about itself: dx = -w [x - p]× G J dθ, with the vertex's weight w of all joints below
-    it, the posed joint p, its world rotation G, and the right Jacobian J of its rotation vector θ.
+    A joint turns what hangs on it about itself: dx = -w [x - p]× G J dθ. Here w is the vertex's total weight of this
+    joint and all below it, p the posed joint, G its world rotation, and J the right Jacobian of its rotation vector θ.
 
     `vertices` are without the translation [m], (V, 3); `covariance` is of rotation vectors [rad²], (72, 72) or
     (24, 3, 3).
@@ -265,7 +265,7 @@ def _input_variance(
 
 
 def _right_jacobians(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of rotation vectors (N, 3) [rad], shape (N, 3, 3): R(θ + dθ) = R(θ) exp([J dθ]×)."""
+    """Right Jacobians J of rotation vectors (N, 3) [rad], shape (N, 3, 3): R(θ + dθ) = R(θ) exp([J dθ]×)."""
     angle = np.linalg.norm(pose, axis=1)[:, None, None]
     x, y, z = pose.T
     zero = np.zeros_like(x)

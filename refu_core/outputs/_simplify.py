@@ -1,7 +1,7 @@
 """Which vertices and triangles a coarse copy of a mesh keeps: half-edge collapses by quadric error, boundary kept.
 
-Garland and Heckbert 1997, with vertices that stay where they are: so a coarse vertex is one of the garment's. Errors
-are those of several shapes of one mesh, summed: a garment folds where its wearer bends.
+As Garland and Heckbert 1997, but vertices stay where they are, so a coarse vertex is one of the garment's. Errors are
+averaged over several shapes of one mesh, since a garment folds where its wearer bends.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from refu_core.mesh import Connectivity
 
 _EVEN = 0.03
-"""How far a triangle's plane may be missed for an edge of length 1: cloth folds elsewhere in each pose, so triangles
-are to be of about one size, and only sharp shapes are worth small ones."""
+"""An edge costs as much as missing a triangle's plane by this share of the edge's length. Cloth folds elsewhere in each
+pose, so triangles should be of about one size; only sharp shapes are worth small ones."""
 _RIM = 3.0
-"""How much more a boundary's line counts than a plane as far off."""
+"""How much more missing a boundary's line counts than missing a plane by the same distance."""
 _LEAST_COSINE = 0.3
-"""Of the angle by which a triangle may turn in one collapse."""
+"""Cosine of the largest angle by which a triangle may turn in one collapse."""
 _LONGEST = 8
-"""Neighbours of a kept vertex: above that, fans of slivers begin."""
+"""Most neighbours of a kept vertex: above this, fans of slivers begin."""
 
 Vector = tuple[float, float, float]
 
@@ -30,10 +30,10 @@ Vector = tuple[float, float, float]
 def simplify(
     shapes: NDArray[np.float64], faces: NDArray[np.int32], most: int
 ) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Collapses edges until the faces, twice, and a wall along the boundary are `most` triangles, if that can be.
+    """Collapses edges until twice the faces and a wall along the boundary are at most `most` triangles, if possible.
 
-    `shapes` (P, V, 3) [m] are of one mesh of faces (F, 3), in the first of which no triangle is turned over. The result
-    are the vertices that are kept, (K,), and faces into them, (G, 3).
+    `shapes` (P, V, 3) [m] are those of one mesh with `faces` (F, 3); no collapse turns a triangle over in the first.
+    Returns the vertices that are kept, (K,), and faces that index these, (G, 3).
     """
     return _Sheet(shapes, faces).collapsed(most)
 
@@ -47,7 +47,7 @@ class _Sheet:
         one = np.ones_like(x)
         terms = (x * x, 2 * x * y, 2 * x * z, 2 * x, y * y, 2 * y * z, 2 * y, z * z, 2 * z, one)
         self.terms = np.stack(terms, -1).reshape(len(self.shapes), -1)
-        """What a quadric is multiplied with for its value at each vertex, shape (V, 10 P)."""
+        """What a quadric is multiplied by to get its value at each vertex, shape (V, 10 P)."""
         self.faces: dict[int, tuple[int, int, int]] = dict(enumerate(map(tuple, faces.tolist())))
         self.fan: list[set[int]] = [set() for _ in self.places]
         self.ring: list[set[int]] = [set() for _ in self.places]
@@ -58,14 +58,14 @@ class _Sheet:
             self.ring[a].add(b)
             self.ring[b].add(a)
         self.rim: list[set[int]] = [set() for _ in self.places]
-        """Its neighbours along the boundary."""
+        """Each vertex's neighbours along the boundary."""
         for a, b in mesh.boundary.tolist():
             self.rim[a].add(b)
             self.rim[b].add(a)
         self.n_rim = len(mesh.boundary)
         every, areas = zip(*(_quadrics(shape, mesh) for shape in shapes), strict=True)
         self.quadrics = np.stack(every, 1).reshape(len(self.shapes), -1) / len(shapes)
-        """Of each vertex the mean over shapes, shape (V, 10 P)."""
+        """Each vertex's quadrics in all shapes, divided by the number of shapes, shape (V, 10 P)."""
         self.areas = np.mean(areas, axis=0)
 
     def collapsed(self, most: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
@@ -87,7 +87,7 @@ class _Sheet:
         return kept.astype(np.intp), of_corner.reshape(-1, 3).astype(np.int32)
 
     def _options(self, edges: Sequence[tuple[int, int]]) -> Iterator[tuple[float, int, int]]:
-        """Those of the edges whose first vertex may be drawn to the second, after what it costs."""
+        """The edges whose first vertex may be drawn to the second, each with what that costs before it."""
         may = [(u, v) for u, v in edges if not self.rim[u] or v in self.rim[u]]
         if not may:
             return
@@ -98,7 +98,7 @@ class _Sheet:
         yield from ((price, *edge) for price, edge in zip(cost.tolist(), may, strict=True))
 
     def _may(self, u: int, v: int) -> bool:
-        """Whether the surface stays one, and no triangle is turned over."""
+        """Whether u may be drawn to v: the surface stays a manifold, and no triangle is turned over."""
         on_rim = v in self.rim[u]
         if self.rim[u] and (not on_rim or len(self.rim[u]) != 2 or self.rim[u] == {v}):
             return False
@@ -153,8 +153,10 @@ def _normal(a: Vector, b: Vector, c: Vector) -> Vector:
 
 
 def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of each vertex the sum of squared distances from the planes around it, by area, as a form (V, 10); and that area
-    [m²], (V,)."""
+    """Each vertex's sum of squared distances from the planes around it as a form (V, 10), and its area [m²], (V,).
+
+    Planes are weighted by area; boundaries add planes of their own.
+    """
     a, b, c = vertices[mesh.faces].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     double = np.linalg.norm(normal, axis=1)

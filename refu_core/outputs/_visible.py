@@ -1,4 +1,4 @@
-"""What a camera sees of meshes: vertices against a buffer of depths."""
+"""What a camera sees of meshes: vertices are compared with a depth buffer."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from refu_core.mesh import as_points, check_faces
 from refu_core.outputs import _visible_kernels as kernels
 
 NEAR = 0.05
-"""What is nearer to the camera isn't seen [m]."""
+"""Anything nearer to the camera than this isn't seen [m]."""
 TOLERANCE = 0.002
-"""A vertex this far behind a surface still lies on it [m]: less than the margin that cloth keeps from the skin."""
+"""A vertex this far behind a surface still counts as on it [m]: less than the margin that cloth keeps from the skin."""
 BUFFER_WIDTH = 480
-"""Pixels of the buffer's width, unless the camera has fewer: 5 mm each at 2 m, a third of a garment's edges."""
+"""Width of the depth buffer [pixels], unless the camera has fewer: 5 mm each at 2 m, a third of a garment's edges."""
 
 Mesh = tuple[ArrayLike, ArrayLike]
 """Vertices (V, 3) [m] and faces (F, 3)."""
@@ -30,9 +30,9 @@ Mesh = tuple[ArrayLike, ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class PinholeCamera:
-    """A camera without distortion: x to the right, y down, z forward, as ROS has optical frames.
+    """A camera without distortion: x to the right, y down, z forward, as in the optical frames of ROS.
 
-    Raises `MeshError` for numbers that make no camera.
+    Raises `MeshError` for numbers that can't be a camera's.
     """
 
     width: int
@@ -46,7 +46,7 @@ class PinholeCamera:
     rotation: NDArray[np.float64]
     """Takes a direction in the meshes' axes to the camera's, shape (3, 3)."""
     translation: NDArray[np.float64]
-    """Where the meshes' origin is as the camera sees it [m], shape (3,)."""
+    """The meshes' origin in the camera's axes [m], shape (3,)."""
 
     def __post_init__(self) -> None:
         rotation = np.asarray(self.rotation, dtype=np.float64)
@@ -79,7 +79,7 @@ class PinholeCamera:
 
         Raises:
             FrameError: `target` or `eye` aren't three numbers.
-            MeshError: it looks straight up or down, or has no width.
+            MeshError: `fov` isn't between 0 and π; or it looks straight up or down, or nowhere, or has no width.
         """
         target, eye = (checked_numbers(name, at, (3,), np.float64) for name, at in (("target", target), ("eye", eye)))
         if not 0 < fov < math.pi or not width > 0:
@@ -121,11 +121,11 @@ def visible(
     *,
     buffer_width: int = BUFFER_WIDTH,
 ) -> NDArray[np.bool_]:
-    """Which of a mesh's vertices (V, 3) [m] a camera in their axes sees, from whichever side, shape (V,).
+    """Which of a mesh's vertices (V, 3) [m] a camera in their axes sees, from either side, shape (V,).
 
-    `occluders` are other meshes in the same axes: the body, other garments. What is narrower than a pixel of a buffer
-    of depths, which has `buffer_width` columns, may be missed. Raises `MeshError` for vertices that aren't finite, and
-    for what aren't faces of them.
+    `occluders` are other meshes in the same axes: the body, other garments. Anything narrower than a pixel of the depth
+    buffer, which has `buffer_width` columns, may be missed. Raises `MeshError` for vertices that aren't finite, and for
+    faces that don't fit them.
     """
     return all_visible([(vertices, faces), *occluders], camera, buffer_width=buffer_width)[0]
 
@@ -133,7 +133,7 @@ def visible(
 def all_visible(
     meshes: Sequence[Mesh], camera: PinholeCamera, *, buffer_width: int = BUFFER_WIDTH
 ) -> list[NDArray[np.bool_]]:
-    """`visible` of several meshes that hide each other, for the price of one. Raises `MeshError` as that does."""
+    """`visible` for several meshes that hide each other, at the cost of one. Raises `MeshError` as `visible` does."""
     if not meshes:
         return []
     drawn = _draw(meshes, camera.scaled(min(camera.width, buffer_width)))
@@ -149,9 +149,9 @@ def all_visible(
 
 
 def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.float32]:
-    """What a depth camera would measure, without noise, in its own resolution: along its z [m], shape (H, W).
+    """What a depth camera would measure without noise at its own resolution: depth along its z [m], shape (H, W).
 
-    Infinite where nothing is. Raises `MeshError` as `visible`.
+    Infinite where there is nothing. Raises `MeshError` as `visible` does.
     """
     if not meshes:
         return np.full((camera.height, camera.width), np.inf, np.float32)
@@ -171,7 +171,7 @@ def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
     checked = [check_faces(faces, n_vertices=len(own)) for own, (_, faces) in zip(points, meshes, strict=True)]
     ends = np.cumsum([len(own) for own in points])
     starts = [0, *ends[:-1].tolist()]
-    # About the camera, in float64: a person may be far from the origin.
+    # Relative to the camera, in float64: a person may be far from the origin.
     there = (np.concatenate(points) - camera.eye) @ camera.rotation.T
     depth = there[:, 2]
     there[:, :2] *= np.array(camera.focal) / np.maximum(depth, 1e-6)[:, None]

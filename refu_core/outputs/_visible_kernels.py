@@ -1,4 +1,4 @@
-"""Triangles into a buffer of depths, and vertices against it: one code for CPU and CUDA."""
+"""Draws triangles into a depth buffer, and compares vertices with it: the same code for CPU and CUDA."""
 
 import warp as wp
 
@@ -8,7 +8,7 @@ FAR = wp.constant(wp.int64(9223372036854775807))
 
 @wp.func
 def edge(a: wp.vec2, b: wp.vec2, x: float, y: float) -> float:
-    """Twice the signed area of a triangle of two corners and a pixel's middle."""
+    """Twice the signed area of the triangle of two corners, a and b, and the point (x, y)."""
     return (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
 
 
@@ -48,8 +48,8 @@ def raster_kernel(
 
 @wp.func
 def before(f: int, i: int, seen: wp.array[wp.vec3], faces: wp.array2d[wp.int32]) -> wp.vec2:
-    """How far the plane of triangle f is from the camera where vertex i is in the picture [m], and whether the triangle
-    itself is there (1) or not (0)."""
+    """Depth of the plane of triangle f where vertex i is in the picture [m], and 1 if the triangle covers that place,
+    else 0."""
     p = seen[i]
     if faces[f, 0] == i or faces[f, 1] == i or faces[f, 2] == i:
         return wp.vec2(p[2], 1.0)
@@ -74,10 +74,10 @@ def visible_kernel(
     # output
     visible: wp.array[wp.bool],
 ) -> None:
-    """Whether a vertex is within the picture and nothing is before it.
+    """Whether a vertex is within the picture and nothing is in front of it.
 
-    The triangles that are nearest in its pixel and in those around are asked where exactly the vertex is. Where none of
-    them is there, since triangles are smaller than pixels, the plane of that in its own pixel decides.
+    The triangles that are nearest in its pixel and in those around are tested exactly where the vertex is. If none of
+    them covers that place, because triangles are smaller than pixels, the plane of the one in its own pixel decides.
     """
     i = wp.tid()
     p = seen[i]

@@ -1,4 +1,4 @@
-"""What outputs ask of what they are given."""
+"""Checks of what the outputs are given."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from refu_core.errors import MeshError, require_type
 
 
 def require_worn(output: object, known: Collection[str]) -> None:
-    """Raises `MeshError` for what no pipeline made, and for a garment that isn't `known`."""
+    """Raises `MeshError` for anything but a pipeline's output, and for a garment that isn't `known`."""
     require_type(output, Mapping, "a pipeline's output of one person", error=MeshError)
     assert isinstance(output, Mapping)
     for name in output:

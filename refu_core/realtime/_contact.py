@@ -1,4 +1,4 @@
-"""Collision handling of a frame: garments off one posed body, and off each other."""
+"""Collision handling of a frame: brings garments off one posed body, and off each other."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from refu_core.sdf import ApproxSdf, MeshSdf, exact_sdf
 
 
 class Worn(NamedTuple):
-    """One garment of one person, as the root sees it."""
+    """One garment of one person, in the root's axes."""
 
     vertices: Tensor
     """[m], shape (V, 3)."""
@@ -42,7 +42,7 @@ class Worn(NamedTuple):
     numbers: Tensor
     """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered` of a `GarmentStats`, float32, shape (5,)."""
     n_clipped: Tensor
-    """Vertices that weren't asked for their distance, since they are far off, shape ()."""
+    """How many vertices are so far off that their distance wasn't computed, shape ()."""
 
 
 N_NUMBERS = 5
@@ -60,9 +60,9 @@ class ContactStage:
         certify: bool = True,
         settings: ContactSettings = DEFAULT_CONTACT,
     ) -> None:
-        """With the exact distance, or with the approximate one.
+        """Uses the exact distance if `sdf` is accurate, or else the approximate one.
 
-        Where it is to `certify`, vertices that winding numbers find inside leave, and those without a way out are
+        With `certify`, vertices that winding numbers find inside are brought out, and those without a way out are
         counted.
         """
         self._outfit, self._settings = outfit, settings
@@ -73,7 +73,7 @@ class ContactStage:
         self.order = inner_first(garments)
         """Names from the skin outwards."""
         self._has_room = outfit.collider is not None
-        """For cloth beside limbs."""
+        """Whether a collider makes room for cloth beside limbs."""
         if outfit.collider is not None:
             self._shins, self._limbs = Shins(body), LimbMeshes(body)
             self._skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
@@ -99,12 +99,12 @@ class ContactStage:
         }
 
     def update(self, body: Tensor, n_held: Tensor | int = 0) -> None:
-        """Takes over the body's new pose, shape (V, 3) [m], and how much of its skin has gone as far as it may.
+        """Takes over the body's new pose, shape (V, 3) [m], and how many of its vertices have moved as far as they may.
 
         Raises `MeshError` for a body that isn't finite.
         """
         self._body = body
-        # Where skin has given way as far as it may, there may be less room than cloth needs. A GPU isn't asked.
+        # Where skin has given way as far as it may, cloth may lack room. A GPU isn't asked: there it is assumed.
         self._is_tight = self._has_room and (not self._is_serial or bool(n_held > 0))
         if self._is_tight:
             self._skin.take(body)
@@ -116,11 +116,11 @@ class ContactStage:
             self._shins.update(body)
 
     def unfold(self, name: str, vertices: Tensor, rotation: Tensor) -> Tensor:
-        """Vertices (V, 3) [m] levelled where folded over beside another garment; joints are turned by (24, 3, 3)."""
+        """Vertices (V, 3) [m], levelled where folded over beside another garment, for joint rotations (24, 3, 3)."""
         return self._unfold[name](vertices, rotation) if name in self._unfold else vertices
 
     def press(self, name: str, vertices: Tensor) -> Tensor:
-        """Vertices (V, 3) [m] behind the shins, then between where they are and the skin they lie on, before limbs."""
+        """Vertices (V, 3) [m], kept behind the shins, then drawn back to their skin where a limb comes between."""
         if not self._has_room:
             return vertices
         vertices = self._tents[name](vertices)
@@ -129,9 +129,9 @@ class ContactStage:
     def lift(
         self, name: str, vertices: Tensor, worn: Mapping[str, Worn], *, goes_on: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near one of those, shape (1,).
+        """Vertices (V, 3) [m] off the `worn` inner garments, and how many were too near to one of them, shape (1,).
 
-        It `goes_on` from the last call for the same garments.
+        With `goes_on` it continues from the last call for the same garments.
         """
         n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
         for inner, garment in worn.items():
@@ -153,7 +153,7 @@ class ContactStage:
         scale: float | VertexScale,
         n_layered: Tensor,
     ) -> Worn:
-        """Vertices (V, 3) [m] off the body, which has the last word, and within reach of where limbs `pressed` them.
+        """Brings vertices (V, 3) [m] off the body, which has the last word, but within reach of `pressed` (V, 3) [m].
 
         `raw` (V, 3) [m] are the vertices as they were predicted, `rest` (V, 3) [m] those of the wearer's garment in the
         rest pose, and `on_mean` is as in `Drape`.
@@ -177,16 +177,16 @@ class ContactStage:
         vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
-        if was_torn or worn or self._is_tight:  # Each step goes no farther than that; together they may.
+        if was_torn or worn or self._is_tight:  # No single step goes farther than this; together they may.
             vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
         if self.way_out is not None:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
         return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
 
     def _part(self, name: str, done: Resolution, *, margin: float) -> Resolution:
-        """A garment off the body, off the inner ones where triangles cut each other after all.
+        """Parts a garment that is off the body from inner ones where triangles still cut each other.
 
-        As often as that leaves fewer cuts: in a crease without room the way out of one fold leads into the next.
+        Repeats as long as fewer cuts are left: in a crease without room the way out of one fold leads into the next.
         """
         partings = [layer.parting for layer in self._below[name].values()]
         resolver, before = self.resolvers[name], done.vertices
@@ -203,7 +203,7 @@ class ContactStage:
             n_left = torch.stack([parting.find(parted.vertices) for parting in partings])
             is_better = n_left.sum() < n_cut.sum()
             done = Resolution(*(torch.where(is_better, new, old) for new, old in zip(parted, done, strict=True)))
-            n_cut = torch.where(is_better, n_left, 0)  # nothing is fewer than none: the end, on a GPU, too
+            n_cut = torch.where(is_better, n_left, 0)  # none can't become fewer: this is the end, on a GPU, too
         return done
 
 

@@ -1,4 +1,4 @@
-"""What the calls of a pipeline compute with, so that several may run at the same time."""
+"""The frame steps that a pipeline's calls compute with, so that several calls may run at the same time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ON_GPU = threading.Lock()
 
 
 class Crew:
-    """Frame steps, each with memory of its own, which calls take in turns; one that is free helps with a batch."""
+    """Frame steps, each with memory of its own: every call takes one, and free ones help with a batch."""
 
     def __init__(self, steps: Sequence[FrameStep], *, on_gpu: bool) -> None:
         self._n_steps = len(steps)
@@ -34,9 +34,9 @@ class Crew:
 
     @contextlib.contextmanager
     def turn(self) -> Iterator[FrameStep]:
-        """What one call computes with, as soon as it is free. Raises `RefuError` where it never will be."""
+        """The step that one call computes with, as soon as one is free. Raises `RefuError` if none ever will be."""
         try:
-            step = self._free.get(block=os.getpid() == self._process)  # other threads don't outlive a fork
+            step = self._free.get(block=os.getpid() == self._process)  # after a fork no other thread will free one
         except Empty as error:
             msg = "this pipeline was busy when its process was forked: load one in each process, after the fork"
             raise RefuError(msg) from error
@@ -47,7 +47,7 @@ class Crew:
             self._free.put(step)
 
     def share(self, step: FrameStep, work: Work, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
-        """`work` on frames with a step, and beside it on some of them with each step that is free."""
+        """Does `work` on frames, which are shared out among `step` and all steps that are free."""
         steps = [step]
         with contextlib.suppress(Empty):
             while len(steps) < len(frames) and os.getpid() == self._process:
@@ -57,7 +57,7 @@ class Crew:
         try:
             done = work(step, own)
         finally:
-            wait(started)  # nobody else may take a step before
+            wait(started)  # before that nobody else may take a step
             for other in steps[1:]:
                 self._free.put(other)
         return [*done, *(one for part in started for one in part.result())]

@@ -23,7 +23,7 @@ class Drape(NamedTuple):
     """One garment on a batch of bodies."""
 
     vertices: Tensor
-    """As the root sees them, where skin gives way taken along by it [m], shape (B, V, 3)."""
+    """In the root's axes; where skin gives way, cloth has moved along with it [m], shape (B, V, 3)."""
     unposed: Tensor
     """Before posing [m], shape (B, V, 3)."""
     on_mean: Tensor
@@ -33,10 +33,10 @@ class Drape(NamedTuple):
 
 
 class Dressed(NamedTuple):
-    """A batch of bodies and what they wear, as the root sees them (`RootTurn`)."""
+    """A batch of bodies and what they wear, in the root's axes (`RootTurn`)."""
 
     body: Tensor
-    """The collider: `skin` with its overlaps pulled apart; the same where the outfit has none [m], shape (B, V, 3)."""
+    """The collider: `skin` with its overlaps pulled apart, or `skin` if the outfit has none [m], shape (B, V, 3)."""
     skin: Tensor
     """The posed body, which runs through itself where limbs meet [m], shape (B, V, 3)."""
     aside: Tensor
@@ -45,7 +45,7 @@ class Dressed(NamedTuple):
     turns: list[RootTurn]
     """Bring each person to the world's axes."""
     transforms: RigidTransforms
-    """Of the bodies' joints, that skin and garments were posed with, leading shape (B, 24)."""
+    """Those of the bodies' joints, with which skin and garments were posed, leading shape (B, 24)."""
 
 
 def dress(
@@ -53,9 +53,9 @@ def dress(
 ) -> Dressed:
     """Bodies in poses (B, 24, 3) [rad], dressed by the backbones: posed as g = T(θ, β)(t(β, γ) + D(θ, β, γ)).
 
-    Cloth hangs away from `up` (B, 3), of unit length and in the axes of the roots; from +y if not given.
-    A backbone that heeds the past takes it from `past` (B, 4, 219), which `PoseHistory` explains, rest if not given.
-    Where a collider pulls the skin apart, the cloth that lies on it goes along (`SkinBelow`).
+    Cloth hangs away from `up` (B, 3), of unit length and in the axes that roots are given in; +y by default.
+    A backbone that heeds the past takes it from `past` (B, 4, 219), which `PoseHistory` explains; by default people
+    stood still. Where a collider pulls the skin apart, the cloth that lies on it moves along (`SkinBelow`).
     Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
     differentiable: nothing is remembered, and no device is waited for. `lap` is called at the end of each stage.
     """

@@ -33,7 +33,7 @@ class Person(NamedTuple):
     """One person of a frame."""
 
     turn: Callable[[Tensor], Tensor]
-    """Brings what follows to the world's axes."""
+    """Brings the fields below to the world's axes."""
     body: Tensor
     """The collider [m], shape (V, 3)."""
     skin: Tensor
@@ -52,13 +52,13 @@ class StageClock:
         self._last = time.perf_counter()
 
     def start(self, shared: StageClock, *, share: float) -> None:
-        """Begins a lap, with a share of what another clock was told."""
+        """Begins a lap, and takes over a share of another clock's times."""
         for mine, others in ((self.stages, shared.stages), (self.garments, shared.garments)):
             mine.update({name: share * ms for name, ms in others.items()})
         self._last = time.perf_counter()
 
     def lap(self, stage: str, garment: str | None = None) -> None:
-        """Adds the time since the last lap to a stage, and to a garment that it was for."""
+        """Adds the time since the last lap to a stage, and to a garment if it was for one."""
         now = time.perf_counter()
         ms, self._last = 1e3 * (now - self._last), now
         self.stages[stage] = self.stages.get(stage, 0.0) + ms
@@ -69,12 +69,12 @@ class StageClock:
 class FrameStep:
     """All that is computed for a batch of persons, from poses to worn garments.
 
-    On a GPU nothing in it depends on a number that the device would have to be asked for. So the same launches serve
-    any pose and any (β, γ), and can be captured (`StepGraphs`).
+    On a GPU nothing in it depends on a number that would have to be read back from the device. So the same launches
+    serve any pose and any (β, γ), and can be captured (`StepGraphs`).
     """
 
     def __init__(self, outfit: Outfit, contact: ContactStage | None) -> None:
-        """Without `contact` nothing is done about collisions. One call at a time: both have memory to work in."""
+        """Without `contact` collisions aren't handled. One call at a time: both arguments have memory to work in."""
         self.outfit, self.contact = outfit, contact
         self._order = list(outfit.wearables) if contact is None else contact.order
         self._sizes = [outfit.body.n_vertices * 3] * 2 + [N_SHIFT]
@@ -93,10 +93,10 @@ class FrameStep:
         past: Tensor | None = None,
         up: Tensor | None = None,
     ) -> list[Person]:
-        """Persons in poses (B, 24, 3) [rad]; `past` and `up` as for `dress`, `margins` [m] as the outfit's garments.
+        """Persons in poses (B, 24, 3) [rad]; `past` and `up` as in `dress`, `margins` [m] one per garment.
 
-        `clocks`, one a person, are told how long the stages took; what is done for all at once is shared out. What was
-        predicted may be changed by `adjust` before anything is done about collisions.
+        `clocks`, one per person, are told how long the stages took; time spent on all at once is shared out equally.
+        `adjust` may change what was predicted before collisions are handled.
         """
         shared = StageClock()
         dressed = dress(pose, replace(wearer, outfit=self.outfit), past=past, up=up, lap=shared.lap)
@@ -141,7 +141,7 @@ class FrameStep:
         return persons
 
     def packed(self, inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
-        """The same of `pose`, `past`, `up` and a wearer's tensors: all in one tensor (B, …), which `unpacked` reads."""
+        """The same from `pose`, `past`, `up` and a wearer's tensors, as one tensor (B, …), which `unpacked` reads."""
         rows = []
         wearer = Wearer.of_tensors(self.outfit, inputs)
         for person in self(inputs["pose"], wearer, margins, past=inputs.get("past"), up=inputs.get("up")):
@@ -153,9 +153,9 @@ class FrameStep:
         return torch.stack(rows)
 
     def unpacked(self, packed: NDArray[np.float32]) -> Iterator[Person]:
-        """The persons that were packed, who have been turned; nothing is copied.
+        """The persons that were packed, already in the world's axes; nothing is copied.
 
-        Raises `MeshError` for what isn't finite: a graph can't be interrupted to say so earlier.
+        Raises `MeshError` for numbers that aren't finite: a graph can't be interrupted to say so earlier.
         """
         if not np.isfinite(packed.sum(dtype=np.float64)):
             bad = int((~np.isfinite(packed)).any(axis=1).sum())
@@ -171,12 +171,12 @@ class FrameStep:
 
 
 def shares(n: int, parts: int) -> list[slice]:
-    """A batch of n persons in so many parts, of one size as far as that goes."""
+    """Slices that share out a batch of n persons into so many parts, as equal in size as possible."""
     return [slice(start, end) for start, end in pairwise(n * i // parts for i in range(parts + 1))]
 
 
 def packed_by(steps: Sequence[FrameStep], inputs: Mapping[str, Tensor], margins: tuple[float, ...]) -> Tensor:
-    """`FrameStep.packed` of a batch that several steps share, on a GPU at the same time."""
+    """`FrameStep.packed` of a batch that several steps share; on a GPU they run at the same time."""
     parts = shares(len(inputs["pose"]), min(len(steps), len(inputs["pose"])))
     works = [
         partial(step.packed, {name: tensor[part] for name, tensor in inputs.items()}, margins)

@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_GRAPHS = 8
-"""How many graphs are kept: of so many numbers of persons, most of all."""
+"""How many graphs are kept; mostly they differ in the number of persons."""
 _WARM_UPS = 2
-"""Before a capture: kernels are loaded, and libraries get their memory, which a graph can't do."""
+"""Runs before a capture: they load kernels and give libraries their memory, which a graph can't do."""
 
 
 class CudaCapture:
     """A `torch.cuda.CUDAGraph`, with the launches of Warp's kernels in it; it leaves its result in `output`."""
 
     def __init__(self, run: Callable[[], Tensor], device: torch.device) -> None:
-        """Runs it a few times, then captures it. Raises `RuntimeError` where that can't be done."""
+        """Calls `run` a few times, then captures it. Raises `RuntimeError` if it can't be captured."""
         here, stream = torch.cuda.current_stream(device), torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         stream.wait_stream(here)
         with torch.cuda.stream(stream):
@@ -34,21 +34,22 @@ class CudaCapture:
                 run()
         here.wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
-        # What other threads do with the device meanwhile is theirs.
+        # Other threads may use the device meanwhile.
         capturing = torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local")
         with capturing, joined_capture(device) as self._kept:
             self.output = run()
 
     def replay(self) -> None:
-        """Does it on the current stream."""
+        """Runs the graph on the current stream."""
         self._graph.replay()
 
 
 class StepGraphs:
     """Replays `step`, a function of tensors and of some numbers, and brings its result to the host in one copy.
 
-    The numbers become part of a graph, the tensors' contents don't: these are copied to where it reads them, unless
-    they are the last call's. So there is a graph for each number of persons, and none for each (β, γ).
+    The numbers become part of a graph; the tensors' contents don't: they are copied to where the graph reads them,
+    unless the tensors are those of the last call. So there is a graph for each number of persons, but not for each
+    (β, γ).
     """
 
     def __init__(
@@ -59,14 +60,14 @@ class StepGraphs:
         capture: Callable[[Callable[[], Tensor], torch.device], Any] = CudaCapture,
         most: int = MOST_GRAPHS,
     ) -> None:
-        """For a step that never waits for the device, which gives float32; the graphs used last are kept."""
+        """For a step that never waits for the device and returns float32; the `most` graphs used last are kept."""
         self._step, self._device, self._capture, self._most = step, device, capture, most
         self._graphs: OrderedDict[Hashable, _Graph] = OrderedDict()
         self._has_failed = False
 
     @torch.no_grad()
     def __call__(self, inputs: Mapping[str, Tensor], numbers: tuple[float, ...]) -> NDArray[np.float32]:
-        """What the step gives, in memory of its own. What can't be captured is done launch by launch from then on."""
+        """The step's result, in memory of its own. If a capture fails, calls go launch by launch from then on."""
         if not self._has_failed:
             key = (numbers, tuple(tensor.shape for tensor in inputs.values()))
             try:

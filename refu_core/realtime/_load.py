@@ -1,4 +1,4 @@
-"""What is worn by whom: garments, a body, and the networks that were trained for them."""
+"""Loads what is worn by whom: garments, a body, and the networks that were trained for them."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def load_outfit(
     device: torch.device,
     collider: bool,
 ) -> Outfit:
-    """Loads garments, the body that wears them, and their networks; arguments and errors as of `GarmentPipeline.load`.
+    """Loads garments, the body that wears them, and their networks; arguments and errors as in `GarmentPipeline.load`.
 
-    On a body that isn't the garments' own they are transferred (`worn_on`).
+    To a body that isn't their own, garments are transferred (`worn_on`).
     """
     templates = _templates(garments, device)
     if body is not None and betas_from is not None:
@@ -78,7 +78,7 @@ def _templates(
 
 
 def _cut_for(templates: Mapping[str, GarmentTemplate]) -> str:
-    """The body of all garments. Raises `GarmentError` where they are of several."""
+    """The body that all garments were cut for. Raises `GarmentError` if they were cut for several."""
     bodies = {template.body for template in templates.values()}
     if len(bodies) > 1:
         cut_for = ", ".join(f"{name} ({template.body})" for name, template in templates.items())
@@ -90,10 +90,10 @@ def _cut_for(templates: Mapping[str, GarmentTemplate]) -> str:
 def wearable_of(
     stored: Weights, template: GarmentTemplate, fit: BodyFit | None, *, device: str | torch.device = "cpu"
 ) -> Wearable:
-    """A garment as it was cut, and the networks in `stored`, on the body of `fit` or (None) on its own.
+    """A garment as it was cut, with the networks in `stored`, put on the body of `fit`, or on its own body if None.
 
     Raises:
-        WeightsError: they were trained on a third body, or don't fit the garment.
+        WeightsError: the networks were trained on yet another body, or don't fit the garment.
     """
     worn = worn_on(template, fit)
     trained_on, source = stored.card.get("body_fingerprint"), load_body(template.body).fingerprint

@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SkinShift:
-    """How far the collider has left the skin, to be free of itself: where nothing overlaps, nothing has moved."""
+    """How far the collider is from the skin, so as not to intersect itself; where nothing overlaps, nothing moves."""
 
     n_moved: int = 0
     """Vertices of the body that were moved by more than 0.1 mm."""
     largest: float = 0.0
-    """The longest way of any vertex [m]."""
+    """The farthest that any vertex moved [m]."""
     mean: float = 0.0
-    """The mean of all vertices' ways, those that stayed among them [m]."""
+    """How far vertices moved on average, including those that stayed [m]."""
     n_held: int = 0
-    """Vertices that went as far as skin, or their arm, may (`Collider.shift`): there the body may run through itself
-    still, deeper than any body does, and cloth has no room."""
+    """Vertices that moved as far as skin, or their arm, may (`Collider.shift`): there the body may still run through
+    itself, deeper than any real body does, and cloth has no room."""
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> SkinShift:
-        """Of the four, in this order."""
+        """From these four numbers, in this order."""
         n_moved, largest, mean, n_held = numbers
         return cls(int(n_moved), largest, mean, int(n_held))
 
@@ -41,22 +41,22 @@ class GarmentStats:
     """What collision handling found and did for one garment in one frame."""
 
     n_inside: int = 0
-    """Vertices inside the body before; of an outer garment, once it is off the inner ones."""
+    """Vertices inside the body beforehand; for an outer garment, once it is off the inner ones."""
     n_pushed: int = 0
-    """Vertices that were moved: inside, or nearer to the skin than the margin."""
+    """Vertices that were moved since they were inside, or nearer to the skin than the margin."""
     n_unresolved: int = 0
-    """Vertices inside the body (the collider) afterwards: certified by their winding numbers, unless the pipeline was
-    loaded with `certify=False`; then by the distances that pushed them. 0 with `sdf="none"`."""
+    """Vertices inside the body (the collider) afterwards, certified by their winding numbers; if the pipeline was
+    loaded with `certify=False`, only according to the distances that pushed them. 0 with `sdf="none"`."""
     max_depth: float = 0.0
-    """Deepest penetration before, likewise [m]."""
+    """Deepest penetration beforehand, likewise [m]."""
     n_layered: int = 0
-    """Vertices that were moved since they were under another garment, or nearer to it than the gap between garments."""
+    """Vertices that were moved since they were under another garment, or closer to it than the gap between garments."""
     ms: float = 0.0
     """Wall time of the stages that were run for this garment alone: backbone, layers and refu [ms]; 0 in a graph."""
 
     @classmethod
     def of(cls, numbers: Sequence[float], *, ms: float = 0.0) -> GarmentStats:
-        """Of `n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered`."""
+        """From `n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered`."""
         n_inside, n_pushed, n_unresolved, max_depth, n_layered = numbers
         return cls(int(n_inside), int(n_pushed), int(n_unresolved), max_depth, int(n_layered), ms)
 
@@ -67,13 +67,14 @@ class FrameStats:
 
     stage_ms: Mapping[str, float]
     """Wall time of each stage, all garments together [ms]: body, collider, backbone, sdf (new pose), refu (distances,
-    pushes), and layers where garments are worn over each other; on CUDA, where a graph makes one of them, step."""
+    pushes), layers where garments are worn over each other, and adjust after `GarmentPipeline.adjusted`; on CUDA, where
+    a graph merges them all, only step."""
     garments: Mapping[str, GarmentStats] = field(default_factory=dict)
     is_certified: bool = False
     """Whether `n_unresolved` counts every vertex inside, whatever the frame."""
     within_promise: bool = True
-    """Whether "nothing inside" is promised for the frame (docs/reliability.md): joints and β are within a range, and no
-    two parts of the body are in each other deeper than skin gives way (`shift.n_held`)."""
+    """Whether "nothing inside" is promised for the frame (docs/reliability.md): joints, β and γ are within a range, and
+    no two parts of the body overlap deeper than skin can give way (`shift.n_held`)."""
     skipped: Mapping[str, int] = field(default_factory=dict)
     """How much was left out since it would change nothing. `band`: vertices too far off the skin for their distance to
     matter (accurate); `rest`: the body and garments of a (β, γ) before they are posed, known from an earlier frame;
@@ -106,7 +107,7 @@ class GarmentMesh:
         return self.local + self.transl
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled with all arrays made."""
+        """Copies and pickles have all arrays made."""
         return GarmentMesh, (self.local, partial(np.asarray, self.raw), self.faces, self.transl)
 
     def __repr__(self) -> str:
@@ -156,7 +157,7 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
             raise KeyError(msg) from error
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled with all arrays made."""
+        """Copies and pickles have all arrays made."""
         made = partial(np.asarray, self.body), partial(np.asarray, self.skin)
         return PipelineOutput, (self.garments, *made, self.stats)
 

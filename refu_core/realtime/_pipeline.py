@@ -42,15 +42,15 @@ if TYPE_CHECKING:
     from refu_core.realtime._frame import Adjust, Person
 
 _MOST_WEARERS = 64
-"""Persons whose (β, γ) are remembered, those seen last; each takes about half a megabyte a garment."""
+"""How many persons' (β, γ) are remembered, those seen last; each takes about half a megabyte per garment."""
 
 
 class GarmentPipeline:
     """Predicts garments on SMPL bodies, frame by frame, and brings them off the body (paper, Sec. 3).
 
     Any thread may call a pipeline, set its `margin`, and read what it has returned. As many calls run at the same time
-    as it has `threads`, and others wait; a batch is shared out among those that are free. Load one in each process,
-    after the fork: it can't be pickled.
+    as the pipeline has `threads`, and others wait; a batch is shared out among the free ones. Load a pipeline in each
+    process, after the fork: it can't be pickled.
 
     Example:
         >>> pipeline = GarmentPipeline.load(["tshirt-male"])
@@ -73,15 +73,15 @@ class GarmentPipeline:
         self.body = outfit.body
         """The body model that the garments are worn on."""
         self.fit = outfit.fit
-        """How well the built-in mesh lies on a body that was named; None where none was."""
+        """How well the built-in mesh lies on the body that was named; None if none was."""
         self.garments = {name: one.template for name, one in outfit.wearables.items()}
         """The loaded garments by name."""
         self.untrained = tuple(n for n, one in outfit.wearables.items() if isinstance(one.backbone, Skinned))
         """Names of the garments that no network drapes: they follow the skin."""
         self.heeds_past = any(one.backbone.heeds_past for one in outfit.wearables.values())
-        """Whether frames should tell their past (`PoseHistory`): with the backbone `dynamic`."""
+        """Whether frames should have their past (`PoseHistory`), as the backbone `dynamic` needs it."""
         self.threads = len(steps)
-        """How many calls may run at the same time, and on a GPU parts of a batch."""
+        """How many calls may run at the same time; on a GPU, how many parts of a batch."""
         self._margin = margin
         self._style = style
         on_gpu = outfit.body.device.type == "cuda"
@@ -90,18 +90,18 @@ class GarmentPipeline:
         self._is_certified = contact is not None and contact.way_out is not None
         self._crew = Crew(steps[:1] if on_gpu else steps, on_gpu=on_gpu)
         self._lock = threading.Lock()
-        """Of what is remembered."""
+        """Guards what is remembered."""
         self._faces = {name: one.template.faces.cpu().numpy().copy() for name, one in outfit.wearables.items()}
         for faces in self._faces.values():
             faces.flags.writeable = False  # all frames share them
         self._wearers: OrderedDict[bytes, Wearer] = OrderedDict()
         self._together = lru_cache(self.threads)(Wearer.together)
-        """One wearer of all persons of a call; that of the last calls for the same ones."""
+        """One wearer of all persons of a call; reused for the same persons as in one of the last calls."""
         self._last: tuple[float | None, dict[bytes, PipelineOutput]] = margin, {}
 
     @property
     def warnings(self) -> list[str]:
-        """What there is to warn of before anything is dressed, for people."""
+        """Warnings known before anything is dressed, for people to read."""
         return [] if self.fit is None else self.fit.warnings
 
     @property
@@ -118,7 +118,7 @@ class GarmentPipeline:
         return f"GarmentPipeline({', '.join(self.garments)} on {self.body.name}, {self.body.device})"
 
     def __reduce__(self) -> NoReturn:
-        """Raises `RefuError`: memory that kernels work in can't be taken elsewhere."""
+        """Raises `RefuError`: memory that kernels work in can't be moved elsewhere."""
         msg = "a pipeline can't be pickled or copied: load one in each process, or call one from all threads"
         raise RefuError(msg)
 
@@ -145,25 +145,25 @@ class GarmentPipeline:
         """Loads garments and what they need.
 
         Args:
-            garments: names of built-in ones, paths of garment files, or templates; of one body, unless one is named.
+            garments: names of built-in ones, paths of garment files, or templates; for one body, unless one is named.
             body: who wears them: the path of an SMPL file (`.npz` or official `.pkl`), a built-in name, or a loaded
-                body. Garments and what their networks know are transferred to it, its betas are its own, and weights
-                that were trained on it are taken, too. By default the built-in body that they were cut for.
-            betas_from: the path of an SMPL file whose betas frames have, in place of `body`: the built-in mesh follows
-                them, and the file's own mesh isn't used.
+                body. Garments and what their networks know are transferred to it, frames' betas are then its own, and
+                weights trained on it are accepted, too. By default the built-in body that the garments were cut for.
+            betas_from: the path of the SMPL file that frames' betas belong to, in place of `body`: the built-in mesh
+                follows them, and the file's own mesh isn't used.
             sdf: `hybrid`, `approx`, `accurate` or `none`.
             backbone: `tailornet`, `dynamic` (which heeds `SmplFrame.past`), `mlp`, `gcnn`, or `skinned`, which needs no
-                weights; by default (`auto`) the first of `dynamic` and `tailornet` that ships, `skinned` for others.
+                weights; by default (`auto`) the first of `dynamic` and `tailornet` that ships, `skinned` if neither.
             style: γ of all garments, shape (4,); the mean style if not given.
             margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
-            weights: folder with a folder a garment of weights of one's own (`refu train`); those that ship by default.
+            weights: folder of your own weights (`refu train`), a subfolder per garment; by default those that ship.
             device: torch device, `cpu` or `cuda`.
-            graph: on CUDA, capture the whole of a frame as a CUDA graph; without, it is launched stage by stage.
-            certify: ask for the winding number of every vertex at the end, take those inside out, and count those that
-                have no way out (`n_unresolved`); for a twentieth of a frame's time. Without, what is counted are the
-                distances that pushed them, which may be wrong.
-            collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); without, off
-                the posed body itself as in the paper, in which there is no room where limbs run through each other.
+            graph: on CUDA, capture the whole of a frame as a CUDA graph; otherwise it is launched stage by stage.
+            certify: compute every vertex's winding number at the end, bring vertices that are inside out, and count
+                those without a way out (`n_unresolved`); this takes a twentieth of a frame's time. Otherwise the count
+                relies on the distances that pushed the vertices, which may be wrong.
+            collider: bring garments off a body whose overlaps were pulled apart (`PipelineOutput.body`); otherwise off
+                the posed body itself as in the paper, where limbs that run through each other leave no room.
             contact: the tuned numbers of collision handling.
             threads: how many calls, or parts of a batch, may run at once, each in memory of its own; on a GPU calls
                 take turns, and parts of a batch run at once in a graph.
@@ -194,7 +194,7 @@ class GarmentPipeline:
         gamma = None if style is None else _style(style, torch_device)
         if gamma is not None:
             for one in outfit.wearables.values():
-                one.template.rest(gamma.new_zeros(1, N_BETAS), gamma)  # says now if it has no styles
+                one.template.rest(gamma.new_zeros(1, N_BETAS), gamma)  # raises now if it has no styles
         steps = []
         for k in range(threads if torch_device.type == "cpu" or graph else 1):
             own = outfit.beside() if k else outfit
@@ -213,10 +213,10 @@ class GarmentPipeline:
     def __call__(self, frames: SmplFrame | Sequence[SmplFrame]) -> PipelineOutput | list[PipelineOutput]:
         """Dresses one person, or a batch of persons (one frame each).
 
-        Arrays are read-only: persons of one (β, θ, γ) share them, in a batch and with the last call.
+        Arrays are read-only: persons with the same (β, θ, γ) share them, in a batch and with the last call.
 
         Raises:
-            FrameError: what was given isn't a frame, or holds something else.
+            FrameError: `frames` isn't a frame or a sequence, or has anything but frames in it.
         """
         if not isinstance(frames, SmplFrame):
             require_type(frames, Sequence, "a SmplFrame or a sequence of them", error=FrameError)
@@ -230,9 +230,9 @@ class GarmentPipeline:
     def adjusted(self, frame: SmplFrame, adjust: Adjust) -> PipelineOutput:
         """Dresses one frame, and lets `adjust` change what was predicted before it is brought off the body.
 
-        It is given a `Dressed` of one person as the root sees them, and returns one whose garments may be elsewhere.
-        What it returns is handled like any prediction: nothing is inside the body afterwards. Nothing is remembered of
-        it. On a GPU no graph is used.
+        `adjust` is given a `Dressed` of one person in the root's axes, and returns one whose garments may be elsewhere.
+        What it returns is handled like any prediction: nothing is inside the body afterwards. The result isn't
+        remembered. On a GPU no graph is used.
 
         Raises:
             FrameError: not a `SmplFrame`.
@@ -262,7 +262,7 @@ class GarmentPipeline:
             for key, frame in zip(keys, frames, strict=True)
         ]
 
-    @own_settings()  # of each thread
+    @own_settings()  # each thread has its own
     def _run(
         self, step: FrameStep, frames: Sequence[SmplFrame], margin: float | None, adjust: Adjust | None = None
     ) -> list[PipelineOutput]:
@@ -302,7 +302,7 @@ class GarmentPipeline:
         betas = torch.tensor(frame.betas, device=self.body.device)[None]
         style = self._style if frame.style is None else torch.tensor(frame.style, device=self.body.device)[None]
         wearer = Wearer.of(self.outfit, betas, style)
-        if self._steps[0].contact is not None:  # of a body that its β turn inside out, every vertex would be inside
+        if self._steps[0].contact is not None:  # every vertex would be inside a body that its β turn inside out
             require_outward(wearer.shape.vertices, self.body.faces)
         while len(self._wearers) >= _MOST_WEARERS:
             self._wearers.popitem(last=False)
@@ -316,7 +316,7 @@ class GarmentPipeline:
 
         def on_host(points: Tensor) -> NDArray[np.float32]:
             made: NDArray[np.float32] = turn(points).cpu().numpy()
-            made.flags.writeable = False  # whoever is in the same pose gets it, too
+            made.flags.writeable = False  # others in the same pose get it, too
             return made
 
         def later(points: Tensor) -> Callable[[], NDArray[np.float32]]:
@@ -334,7 +334,7 @@ class GarmentPipeline:
 
 
 def _past(frames: Sequence[SmplFrame]) -> Tensor:
-    """Of frames that weren't told theirs: rest."""
+    """The frames' pasts, shape (B, 4, 219); rest for frames without one."""
     rest = np.zeros((len(LAGS), N_PAST), np.float32)
     return torch.as_tensor(np.stack([rest if frame.past is None else frame.past for frame in frames]))
 
@@ -355,7 +355,7 @@ def _check_margin(margin: float | None) -> None:
 
 def _style(value: ArrayLike, device: torch.device) -> Tensor:
     try:
-        with torch.enable_grad():  # a tensor that tracks gradients is refused, which would come to nothing here
+        with torch.enable_grad():  # refuses a tensor that tracks gradients, as none are computed here
             style = checked_numbers("style", value, (N_STYLES,), np.float32, MAX_COEFFICIENT)
     except FrameError as error:
         raise GarmentError(*error.args) from error

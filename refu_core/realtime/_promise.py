@@ -20,10 +20,10 @@ PROMISED_SIZE = 3.0
 """Components of β and γ are promised up to this size, in standard deviations. At a γ of 12, 65 vertices of a T-shirt
 were inside."""
 
-# Degrees about x, y and z: what 6,798 frames of recorded motion and their mirror images take up (walks, runs, jumps,
-# punches, climbing, bending, hanging by the arms), and 20 degrees more; up to what anatomy allows where those clips
-# don't reach it (collars, an arm overhead, a knee on the heel), and beyond for knees and elbows, whose axes estimators
-# often miss. Of the left side; the right side is its mirror image.
+# Degrees about x, y and z: the range of 6,798 frames of recorded motion and their mirror images (walks, runs, jumps,
+# punches, climbing, bending, hanging by the arms), plus 20 degrees. Where those clips don't reach what anatomy allows
+# (collars, an arm overhead, a knee on the heel), ranges go up to that; for knees and elbows, whose axes estimators
+# often miss, they go beyond it. These are of the left side; the right side is its mirror image.
 _RANGES: dict[str, tuple[tuple[float, float], ...]] = {
     "hip": ((-130, 45), (-50, 65), (-50, 50)),
     "knee": ((-45, 150), (-45, 45), (-45, 45)),
@@ -43,7 +43,7 @@ _RANGES: dict[str, tuple[tuple[float, float], ...]] = {
 
 
 PROMISED_BEND = np.radians(80.0)
-"""How far the spine's three joints turn together, at most [rad]: 78 degrees in those clips. From 86 on bellies were
+"""The most that the spine's three joints may turn together [rad]: 78 degrees in those clips. From 86 on, bellies were
 folded upon themselves, and a T-shirt was caught in them."""
 SPINE = [JOINT_NAMES.index(name) for name in ("spine1", "spine2", "spine3")]
 
@@ -60,25 +60,25 @@ def _limits() -> NDArray[np.float64]:
 
 
 PROMISED_POSES = _limits()
-"""Least and largest components of the joints' rotation vectors [rad], those of at most half a turn: (2, 24, 3)."""
+"""Least and largest components of the joints' rotation vectors of at most half a turn [rad], shape (2, 24, 3)."""
 
 
 def within_promise(frame: SmplFrame, style: Sequence[float] | NDArray[np.floating] | None = None) -> bool:
-    """Whether a frame is one of those that "nothing inside" is promised for: joints of people, β and γ up to 3.
+    """Whether "nothing inside" is promised for a frame: its joints are within people's range, β and γ up to 3.
 
     `style` is the γ (4,) that is worn; None is the mean style.
 
-    The promise has one more condition, which only the posed body tells: `FrameStats.within_promise`.
+    The promise has one more condition, which only the posed body can tell: `FrameStats.within_promise`.
     """
     low, high = PROMISED_POSES
     pose = frame.pose
-    if ((pose < low) | (pose > high)).any():  # or it is the same rotation by another vector
+    if ((pose < low) | (pose > high)).any():  # unless another vector of the same rotation is within
         angle = np.linalg.norm(pose.astype(np.float64), axis=1, keepdims=True)
         turns = np.round(angle / (2 * np.pi))
         pose = pose * (1 - 2 * np.pi * turns / np.maximum(angle, 1e-9))
         if ((pose < low) | (pose > high)).any():
             return False
-    # Together they turn no farther than their sum, which is enough to know of most frames.
+    # Together they turn no farther than the sum of their angles, which is enough to decide most frames.
     if float(np.linalg.norm(pose[SPINE], axis=1).sum()) > PROMISED_BEND and spine_bend(pose) > PROMISED_BEND:
         return False
     sizes = np.abs(np.concatenate((frame.betas, () if style is None else style)))

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RootTurn:
-    """Turns one person about their root: they are dressed as the root sees them, whichever way they face or lie.
+    """Turns one person about their root: they are dressed in the root's axes, whichever way they face or lie.
 
-    In world axes a turn would move vertices by millimetres at a fold, and by centimetres where limbs run into each
-    other: the approximate distance would look up other guides, and rounding would decide thresholds anew.
+    In world axes, turning a person would move vertices by millimetres at a fold, and by centimetres where limbs run
+    into each other: the approximate distance would look up other guides, and rounding would decide thresholds anew.
     """
 
     rotation: Tensor
@@ -34,7 +34,7 @@ class RootTurn:
 
         Args:
             pose: Rotation vectors [rad], shape (B, 24, 3).
-            joints: Of their rest poses [m], shape (B, 24, 3) or (1, 24, 3).
+            joints: Joints in their rest poses [m], shape (B, 24, 3) or (1, 24, 3).
         """
         rotations, roots = rotvec_to_rotmat(pose[:, 0]), joints[:, 0]
         shifts = roots - (rotations @ roots.unsqueeze(-1)).squeeze(-1)
@@ -46,6 +46,6 @@ class RootTurn:
         return torch.addmm(self.shift, points, self.rotation.T)
 
     def to_host(self, points: Tensor) -> NDArray[np.float32]:
-        """The same as an array."""
+        """The same, as an array on the host."""
         seen: NDArray[np.float32] = self(points).cpu().numpy()
         return seen

@@ -30,13 +30,13 @@ class Wearable:
     margin: float
     """ε that the networks were trained with [m]."""
     betas: ShapeMap | None = None
-    """The body's betas to those of the body that the networks were trained on; None where that is this one."""
+    """Maps the body's betas to those of the body that the networks were trained on; None if that is the same body."""
     knows_arms: bool = False
-    """Whether the networks have learnt where cloth lies beside arms: they are told where those are, and in their
+    """Whether the networks have learnt where cloth lies beside arms: they are told where the arms are, and in their
     samples arms were where people have them."""
 
     def known_as(self, betas: Tensor) -> Tensor:
-        """The networks' betas for those of the body, (B, 10) both."""
+        """The networks' betas for those of the body, both (B, 10)."""
         return betas if self.betas is None else self.betas(betas)
 
 
@@ -48,9 +48,9 @@ class Outfit:
     wearables: Mapping[str, Wearable]
     """By name."""
     collider: Collider | None = None
-    """What of the posed body garments are brought off; None for the posed body as it is, which runs through itself."""
+    """Makes the body that garments are brought off; None for the posed body as it is, which may run through itself."""
     fit: BodyFit | None = None
-    """What a body that isn't the garments' own has to do with the built-in ones."""
+    """How a body that isn't the garments' own relates to the built-in ones."""
 
     @cached_property
     def below(self) -> Mapping[str, SkinBelow]:
@@ -95,9 +95,9 @@ class Wearer:
 
     @classmethod
     def of(cls, outfit: Outfit, betas: Tensor, style: Tensor | None = None) -> Wearer:
-        """Of betas (B, 10) and style (B, 4), the mean style if not given. Garments of one style keep theirs.
+        """For betas (B, 10) and style (B, 4), the mean style if not given. Garments with only one style keep it.
 
-        Differentiable. Raises `FrameError` for no tensors of these shapes, or of another precision than the body.
+        Differentiable. Raises `FrameError` for anything but tensors of these shapes in the body's precision.
         """
         require_batch("betas", betas, (N_BETAS,), outfit)
         if style is not None:
@@ -124,14 +124,14 @@ class Wearer:
 
     @classmethod
     def together(cls, wearers: Sequence[Wearer]) -> Wearer:
-        """The persons of several in the same outfit, one after another."""
+        """The persons of several wearers in the same outfit, one after another."""
         if len(wearers) == 1:
             return wearers[0]
         each = [wearer.tensors() for wearer in wearers]
         return cls.of_tensors(wearers[0].outfit, {name: torch.cat([one[name] for one in each]) for name in each[0]})
 
     def tensors(self) -> dict[str, Tensor]:
-        """All that it holds but the outfit, by name; each tensor leads with B."""
+        """All that it holds except the outfit, by name; the first axis of each tensor is B."""
         found = {"betas": self.betas, "style": self.style}
         found |= {"vertices": self.shape.vertices, "joints": self.shape.joints}
         for name, garment in self.garments.items():
@@ -140,7 +140,7 @@ class Wearer:
 
 
 def require_batch(name: str, value: Tensor, row: tuple[int, ...], outfit: Outfit, sizes: Sequence[int] = ()) -> None:
-    """Raises `FrameError` for what isn't a tensor (B, *row) of the body's precision, B one of `sizes` if given."""
+    """Raises `FrameError` unless `value` is a tensor (B, *row) of the body's precision, with B in `sizes` if given."""
     dtype, wanted = outfit.body.dtype, " or ".join(map(str, dict.fromkeys(sizes))) or "B"
     require_type(value, Tensor, f"{name} as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
     if value.shape[1:] != row or not value.ndim or value.dtype != dtype or (sizes and len(value) not in sizes):

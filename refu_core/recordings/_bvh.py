@@ -1,7 +1,7 @@
-"""BVH: any person's skeleton in motion, fitted with SMPL's by the positions of its joints.
+"""BVH: any person's skeleton in motion; SMPL's skeleton is fitted to the positions of its joints.
 
-A BVH file says nothing of what its joints are but their names, nothing of its units, and its rest pose may be any. So
-its joints are posed, known by their names, and followed as keypoints are.
+A BVH file identifies its joints only by their names, doesn't give its units, and may have any rest pose. So its joints
+are posed, recognised by their names, and followed as keypoints are.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ _NAMES = {
     "neck": ("neck",),
     "head": ("head",),
 }
-"""What joints are called, without their side; the first that a file has and that is nothing else yet. A `shoulder` is a
-collar where there is an arm, too, and a `foot` the ball of one where there is an ankle (SMPL, Kinect)."""
+"""Names of joints, without their side. The first name that a file has is taken, unless its joint already is another
+point. A `shoulder` is a collar in files that also have an arm, and a `foot` the ball of the foot in files that also
+have an ankle (SMPL, Kinect)."""
 _BARE = frozenset(name for names in _NAMES.values() for name in names)
 _SIDED = ("hip", "knee", "ankle", "foot", "shoulder", "elbow", "wrist")
 _NEEDED = tuple(f"{side}_{part}" for side in "lr" for part in ("hip", "knee", "shoulder", "elbow"))
@@ -58,7 +59,7 @@ class _Joint:
 def read_bvh(
     path: Path, *, error: type[RefuError], fps: float | None, axes: Axes, worn: Proportions | None
 ) -> Recording:
-    """The motion of a BVH file. Raises `error` for a damaged one, and for a skeleton that isn't a person's."""
+    """The motion of a BVH file. Raises `error` for a damaged file, and for a skeleton that isn't a person's."""
     text = read_file(path, most=_MAX_BYTES, error=error, wanted=WANTED).decode("utf-8", "replace")
     try:
         joints, rows, seconds = _parsed(text)
@@ -70,7 +71,7 @@ def read_bvh(
 
 
 def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
-    """Joints, a row of channels a frame, and the seconds between frames. Raises `ValueError`."""
+    """The joints, one row of channels per frame, and the seconds between frames. Raises `ValueError`."""
     hierarchy, word, motion = text.partition("MOTION")
     hierarchy = re.sub(r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)", _one_word, hierarchy)
     head = re.match(r"\s*Frames:\s*(\d+)\s+Frame\s+Time:\s*([-+.\deE]+)", motion) if word else None
@@ -134,7 +135,7 @@ def _placed(joints: list[_Joint], rows: Array) -> Array:
         angles: list[Array] = []
         for name, column in zip(joint.channels, own.T, strict=True):
             kind, axis = _CHANNELS[name]
-            if kind == "position":  # in place of the offset: the root's, and of every joint in some files
+            if kind == "position":  # replaces the offset: for the root, and in some files for every joint
                 way[:, axis] = column
             else:
                 order, angles = order + "XYZ"[axis], [*angles, column]
@@ -170,7 +171,7 @@ def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: P
 
 
 def _points(joints: list[_Joint]) -> dict[str, int]:
-    """The joint that each point of the body is."""
+    """The number of the joint at each point of the body."""
     sides: dict[tuple[str, str], int] = {}
     for i, joint in enumerate(joints):
         if joint.name:
@@ -188,7 +189,7 @@ def _points(joints: list[_Joint]) -> dict[str, int]:
 
 
 def _sided(name: str) -> tuple[str, str]:
-    """The side, `l`, `r` or none, and the rest of a joint's name, in any of the ways that tools write it."""
+    """The side (`l`, `r` or empty) and the rest of a joint's name, in any of the ways that tools write them."""
     bare = re.split(r"[:|]", name)[-1]
     match = re.fullmatch(r"(?i)(?:.*[_. -])?(left|right)[_. -]?(.+)", bare)
     match = match or re.fullmatch(r"(?:.*[_. -])?([lLrR])(?:[_. -]|(?=[A-Z]))(.+)", bare)

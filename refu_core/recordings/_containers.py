@@ -30,18 +30,18 @@ _UNPACKERS: dict[bytes, Callable[[], Any]] = {
     b"BZh": bz2.BZ2Decompressor,
     b"\xfd7zXZ": lambda: lzma.LZMADecompressor(memlimit=_MOST_HELD),
 }
-"""Of what packed files begin with, as gzip and joblib make them."""
+"""Decompressors, by the bytes that compressed files begin with; gzip and joblib make such files."""
 _MOST_NODES = 20_000
 MOST_DEPTH = 5
-"""Values in values that are looked into; trackers write three."""
+"""Levels of nested values that are searched; trackers write three."""
 _MOST_ITEMS = 2_000_000
-"""Of lists: a quarter of an hour of poses at 30 Hz."""
+"""Most items in a file's lists: a quarter of an hour of poses at 30 Hz."""
 _MOST_HELD = 256 << 20
-"""Of a dictionary in an array, and of what was packed [bytes]."""
+"""Largest size of a dictionary in an array, and of unpacked data [bytes]."""
 
 
 class Content:
-    """What a file holds: mappings, lists and arrays in each other. Arrays are made when they are asked for."""
+    """What a file holds: nested mappings, lists and arrays. Arrays are made when they are asked for."""
 
     def __init__(self, root: Any, arrays: PickledArrays | None = None) -> None:
         self.root = root
@@ -50,7 +50,7 @@ class Content:
         self._made: dict[int, tuple[Any, NDArray[Any]]] = {}
 
     def array(self, value: Any) -> NDArray[Any]:
-        """The array that a value stands for; a list of rows is one, too. Raises `ValueError` for anything else."""
+        """The array that a value stands for; a list of rows counts as one. Raises `ValueError` for anything else."""
         if id(value) in self._made:
             return self._made[id(value)][1]
         return self._array(value, 0)
@@ -59,7 +59,7 @@ class Content:
         if isinstance(value, np.ndarray):
             return value
         known = self._made.get(id(value))
-        if _is_list(value):  # one that is shared is made once, and counts as often as it is seen
+        if _is_list(value):  # a shared list is converted once, but counts each time it is seen
             self._left -= len(value) if known is None else known[1].size
         if depth > MOST_DEPTH or self._left < 0:
             msg = f"lists of lists, more than {MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
@@ -78,11 +78,11 @@ class Content:
                 array = self._arrays.of(value)
         except DAMAGE as cause:
             raise ValueError(told(cause)) from cause
-        self._made[id(value)] = value, array  # held beside its array, so that the number stays its own
+        self._made[id(value)] = value, array  # the value is kept, so that its id is never reused
         return array
 
     def nodes(self) -> Iterator[tuple[tuple[Key, ...], Mapping[Key, Any]]]:
-        """Every mapping in the file and the way to it, from the outside inwards."""
+        """Every mapping in the file and the path to it, from the outside inwards."""
         todo: list[tuple[tuple[Key, ...], Any]] = [((), self.root)]
         for count, (path, value) in enumerate(todo):
             inside = entries(value)
@@ -94,7 +94,7 @@ class Content:
                 todo += [((*path, key), item) for key, item in inside.items() if entries(item) is not None]
 
     def renamed(self, names: Mapping[Key, Key]) -> Content:
-        """The same with other names, wherever they stand."""
+        """The same content with keys renamed, wherever they occur."""
 
         def other(value: Any, depth: int) -> Any:
             inside = entries(value)
@@ -111,7 +111,7 @@ def _is_list(value: Any) -> bool:
 
 
 def entries(value: Any) -> Mapping[Key, Any] | None:
-    """The entries of a mapping, of an object's attributes, or of a list of such; None for anything else."""
+    """The entries of a mapping, an object's attributes, or the items of a list of these; None for anything else."""
     if isinstance(value, dict):
         return value
     if isinstance(value, Record):
@@ -126,7 +126,7 @@ def entries(value: Any) -> Mapping[Key, Any] | None:
 
 
 def open_content(path: Path, *, error: type[RefuError]) -> Content:
-    """Opens a file of any of the kinds. Raises `error` for one that can't be read."""
+    """Opens a file of any supported kind. Raises `error` for one that can't be read."""
     with open_file(path, most=1 << 32, error=error, wanted=WANTED) as file:
         magic = file.read(6)
     if path.suffix == ".npz" or magic.startswith(_ZIP):
@@ -173,12 +173,12 @@ def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
 
 
 def _steps(name: str) -> list[str]:
-    """Names of arrays in groups, as in `smpl_params_global/body_pose`."""
+    """The parts of an array's name that contains groups, such as `smpl_params_global/body_pose`."""
     return [step for step in name.replace(".", "/").split("/") if step] or [name]
 
 
 def _object(path: Path, name: str) -> Any:
-    """The dictionary in an array of objects, None where it is an array of anything else."""
+    """The dictionary in an array of objects; None if the array holds anything else."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as member:
             head = member.read(128)
@@ -204,7 +204,7 @@ def _npy(file: BinaryIO, size: int) -> Content:
 
 
 def _unpacked(packed: bytes, unpacker: Any) -> bytes:
-    """Raises `ValueError` for more than a pickle may have."""
+    """The unpacked data. Raises `ValueError` if it is cut short, or larger than `_MOST_HELD`."""
     unpacked: bytes = unpacker.decompress(packed, _MOST_HELD + 1)
     if not unpacker.eof or len(unpacked) > _MOST_HELD:
         msg = f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short"

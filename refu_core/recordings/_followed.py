@@ -1,4 +1,4 @@
-"""Motion of a body that isn't SMPL, from where points of it are: SMPL's skeleton follows them as it does a tracker."""
+"""Motion of a body that isn't SMPL, from the places of its points: SMPL's skeleton follows them like keypoints."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _SETTINGS = TrackerSettings(noise=0.01, rest_after=1.0)
 _FIT = 100  # frames that a person's shape is taken from
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
 _LEG = 0.82
-"""Hip to knee to ankle of the mean body [m]."""
+"""Length of the mean body's leg, from hip to knee to ankle [m]."""
 _LEGS = (0.45, 1.1)
-"""Of people [m]; a unit with which it's outside isn't meant."""
+"""Shortest and longest leg of a person [m]; a unit that gives any other length can't be the file's."""
 _SMPL = "pelvis l_hip r_hip spine_low l_knee r_knee spine_mid l_ankle r_ankle spine_high l_foot r_foot neck l_clavicle "
 _SMPL += "r_clavicle head l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist"
 SMPL_POINTS = tuple(_SMPL.split())
-"""Joints of SMPL that SMPL-H and SMPL-X have, too, as the keypoint layouts call them."""
+"""SMPL's joints that SMPL-H and SMPL-X also have, by their names in the keypoint layouts."""
 _BONES = (0.4, 2.5)
-"""How long a bone is beside those of the mean body, each as a share of the legs."""
+"""Least and greatest ratio of a bone's length to the mean body's, each taken as a share of the length of the legs."""
 _NOTHING = 1e-3
 
 
@@ -39,12 +39,12 @@ def follow(
     worn: Proportions | None,
     notes: list[str],
 ) -> Recording:
-    """The motion of a person whose `points`, by the names of keypoint layouts, are in places (T, K, 3) [m].
+    """The motion of a person whose `points`, named as in the keypoint layouts, are at `places` (T, K, 3) [m].
 
-    A point that isn't seen is NaN. The betas are `worn`'s, the neutral body's if not given. What is taken for granted
-    is added to `notes`, which the recording gets.
+    A point that isn't seen is NaN. The betas are fitted to the body `worn`, or to the neutral body if it isn't given.
+    Every assumption is added to `notes`, which go into the recording.
 
-    Raises `ValueError` where no frame shows a person.
+    Raises `ValueError` if no frame shows a person.
     """
     known_body = Proportions.builtin("neutral") if worn is None else worn
     skeleton = Skeleton(layout_of("recording", tuple(points)), known_body)
@@ -69,9 +69,10 @@ def follow(
 
 
 def are_places(array: NDArray[np.float64]) -> bool:
-    """Whether (T, n, 3) are places of SMPL's joints: between them are a person's bones, in every frame.
+    """Whether an array (T, n, 3) holds places of SMPL's joints: in every frame, the bones between them are a person's.
 
-    Rotation vectors have as many numbers, and HumanML3D's and others' files of places no name that tells them apart.
+    Rotation vectors have the same shape, and files of places, HumanML3D's and others', have no name that tells the two
+    apart.
     """
     low, high = _BONES
     n = min(len(SMPL_POINTS), array.shape[1])
@@ -88,9 +89,9 @@ def are_places(array: NDArray[np.float64]) -> bool:
 
 
 def metres_of(points: Sequence[str], places: NDArray[np.float64], notes: list[str]) -> float:
-    """Metres a unit in which points (K, 3) are given: legs are as long as people's. Adds to `notes` which it is.
+    """Metres per unit of points (K, 3): with it the legs are as long as a person's. Adds the unit to `notes`.
 
-    Raises `ValueError` where legs have no length.
+    Raises `ValueError` if the legs have no length.
     """
     at = dict(zip(points, places, strict=True))
     ends = ("l_hip", "l_knee", "l_ankle") if "l_ankle" in at else ("l_hip", "l_knee")

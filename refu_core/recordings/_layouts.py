@@ -1,6 +1,6 @@
-"""The one table of what files of motion are laid out like: which arrays hold the pose, the place, the shape.
+"""The one table of how files of motion are laid out: which arrays hold the pose, the place, the shape.
 
-A file is recognised by the names of its arrays; how each holds its rotations is seen from its shape (`_rotations`).
+A file is recognised by the names of its arrays. How an array holds rotations is told by its shape (`_rotations`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from refu_core.recordings._mhr import N_KEYPOINTS
 from refu_core.recordings._rotations import BODY, WHOLE
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
-"""Of files that hold motion."""
+"""Suffixes of files that hold motion."""
 
 
 ROOT_PLACES = ("root_translation", "root_trans", "root_transl")
@@ -23,28 +23,28 @@ class Layout:
     """One way to lay out a person's motion."""
 
     writers: str
-    """Who writes it."""
+    """Who writes this layout."""
     pose: tuple[str, ...]
-    """Arrays whose joints, one after another, are the pose; the root first where there is one."""
+    """Arrays whose joints, one array after another, are the pose; the root comes first if there is one."""
     transl: tuple[str, ...] = ("trans", "transl", "translation", *ROOT_PLACES)
     """Names that the translation may have [m]."""
     betas: tuple[str, ...] = ("betas", "beta", "shape")
     """Names that the shape may have."""
     is_time_last: bool = False
     repeats_root: bool = False
-    """Whether the second array has room for the root, too, and is zero there."""
+    """Whether the second array also has a place for the root, with zeros in it."""
     is_whole: bool = True
-    """Whether that is the whole pose; beside others there may be a root, or rotations, under unknown names."""
+    """Whether these arrays are the whole pose; if not, there may be a root, or rotations, under unknown names."""
     holds_places: bool = False
-    """Whether the pose is places of joints, and no rotations."""
+    """Whether the pose consists of places of joints instead of rotations."""
     counts: tuple[int, ...] = ()
-    """Of joints or points, where they are others than SMPL's."""
+    """Numbers of joints or points, where they aren't SMPL's."""
     turns_about_origin: bool = False
-    """Whether the root turns the body about the origin of its mesh, and not about its pelvis."""
+    """Whether the root turns the body about the origin of its mesh instead of its pelvis."""
 
     @property
     def joints(self) -> tuple[tuple[int, ...], ...]:
-        """How many each array may have."""
+        """How many joints each array may have."""
         if len(self.pose) == 1:
             return (self.counts or (*WHOLE, *BODY),)
         return (1,), (*BODY, *WHOLE) if self.repeats_root else BODY
@@ -57,7 +57,7 @@ MHR = Layout(
     is_whole=False,
     counts=(N_KEYPOINTS,),
 )
-"""Its keypoints, about the body, and where that is before the camera [m]."""
+"""Its keypoints, relative to the body, and where the body is in front of the camera [m]."""
 
 LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="WHAM, in the world", pose=("pose_world",), transl=("trans_world",)),
@@ -95,17 +95,17 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="MDM's samples", pose=("motion",), is_whole=False, is_time_last=True, holds_places=True),
     MHR,
 )
-"""In the order of preference, where a file holds several."""
+"""In order of preference, for files that hold several."""
 
 OF_SMPLX = ("global_orient", "body_pose")
-"""Arrays that are of SMPL-X where they hold 22 joints; AMASS's of 22 are of SMPL-H, too."""
+"""Arrays that are SMPL-X's if they hold 22 joints; AMASS's arrays of 22 joints may also be SMPL-H's."""
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate", "frameRate", "FPS")
 GENDERS = ("gender", "genders")
 FRAME_NUMBERS = ("frame_ids", "frame_id")
 LENGTHS = "lengths"
-"""How many frames each sample of a batch has; the others pad it."""
+"""How many frames each sample of a batch has; the rest is padding."""
 SCALINGS = ("smpl_scaling",)
-"""AIST++'s translations are of a body that is larger by so much."""
+"""AIST++'s translations are those of a body that is larger by this factor."""
 MODELS = ("surface_model_type",)
 
 SOMA_NAMES = "joint_names"
@@ -113,16 +113,16 @@ _SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_c
 TRACK_IDS = ("track_id", "person_id", "tid", "id")
 
 POSE_KEYS = frozenset(name for layout in LAYOUTS if layout.is_whole for name in layout.pose)
-"""Of whole poses."""
+"""Names of the arrays of whole poses."""
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
     | {*RATES, *GENDERS, *FRAME_NUMBERS, LENGTHS, *SCALINGS, *MODELS, *_SOMA}
 )
-"""Everything that is read; all else in a file, meshes and pictures, is left unread."""
+"""Names of everything that is read; all else in a file, such as meshes and pictures, is left unread."""
 
 
 def spelled(key: object) -> str:
-    """A name without regard to how its words are put together: `globalOrient` is `global_orient`."""
+    """A name without its separators and capitals, so that `globalOrient` equals `global_orient`."""
     return str(key).replace("_", "").replace("-", "").lower()
 
 
@@ -130,12 +130,12 @@ _SPELLED = {spelled(name): name for name in sorted(ALL_KEYS)}
 
 
 def is_like_known(key: object) -> bool:
-    """Whether a name ends like a known one."""
+    """Whether a name ends with a known one, however it is spelled."""
     return spelled(key).endswith(tuple(_SPELLED))
 
 
 def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
-    """Known names for names that are spelled otherwise, or with a word before them; none where there is no pose.
+    """Known names for those `keys` that are spelled differently or have a prefix; none where there is no pose.
 
     Trackers write `smpl_body_pose`, `globalOrient` and `Body-Pose`.
     """
@@ -159,7 +159,7 @@ UNREAD = {
     "HumanML3D features": ("motion_feats", "new_joint_vecs"),
     "a body model's": ("J_regressor",),
 }
-"""What is recognised and can't be read, by names that give it away."""
+"""What is recognised but can't be read, with the names that give it away."""
 UNREAD_ADVICE = {
     "MHR (SAM 3D Body)": "save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
     "HumanML3D features": "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)",

@@ -1,4 +1,4 @@
-"""MHR as SAM 3D Body writes it: a body that isn't SMPL's is followed by the keypoints beside its parameters."""
+"""MHR as SAM 3D Body writes it: not SMPL's body, so the keypoints beside its parameters are followed instead."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _BODY = "nose l_eye r_eye l_ear r_ear l_shoulder r_shoulder l_elbow r_elbow l_hi
 _BODY += "l_big_toe l_small_toe l_heel r_big_toe r_small_toe r_heel"
 _PLACES = dict(zip(_BODY.split(), range(21), strict=True))
 _PLACES |= {"r_index": 28, "r_pinky": 40, "r_wrist": 41, "l_index": 49, "l_pinky": 61, "l_wrist": 62, "neck": 69}
-"""Which of the 70 are points of the keypoint layouts; of a hand its knuckles, as fingers bend."""
+"""Which of the 70 each point of the keypoint layouts is; on a hand they are the knuckles, since fingers bend."""
 POINTS = tuple(_PLACES)
 _MOST_LOST = 100
-"""Frames for one in which a person is seen; numbers that say more than that are none."""
+"""Most frames in all for each one in which the person is seen; frame numbers that claim more are ignored."""
 
 
 def is_of_mhr(keypoints: NDArray[Any]) -> bool:
-    """Whether these are frames of MHR's 70: most estimators have other keypoints of that name."""
+    """Whether these are frames of MHR's 70 keypoints: most estimators write other ones under that name."""
     return keypoints.dtype.kind in "iuf" and keypoints.shape[1:] in ((N_KEYPOINTS, 3), (3 * N_KEYPOINTS,))
 
 
@@ -29,7 +29,7 @@ def places_of_mhr(
     """Places of `POINTS` [m], shape (T, K, 3), NaN in frames in which the person was lost.
 
     Args:
-        keypoints: about the body [m], (N, 70, 3) or (N, 210).
+        keypoints: relative to the body [m], (N, 70, 3) or (N, 210).
         place: of the body [m], (N, 3).
         at: which of the T frames they are, (N,); None for all.
     """

@@ -30,7 +30,7 @@ _WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
 _SHOWN = 8
 _ROOTS = ("root", "orient", "globalrot")
 _NO_ROOTS = ("trans", "pos", "loc", "vel")
-"""Parts of what roots are called, and of what else is called so."""
+"""Parts of the names of roots, and parts that show that such a name means something else."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class _Found:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """What is in the world before what is in a camera, then the order of the table."""
+        """Motion in the world ranks before motion in a camera; then the order of the table decides."""
         words = [str(step).lower() for step in self.path]
         is_world = any(word in step for step in words for word in _WORLD)
         is_camera = any(word in step for step in words for word in _CAMERA)
@@ -63,15 +63,15 @@ def read_recording(
 
     Args:
         path: an .npz, .npy, pickle (also joblib's and torch's) or .bvh. Nothing in a pickle is executed.
-        error: what is raised.
-        fps: frames a second, in place of what the file says; must be given where it says nothing.
+        error: the type of error that is raised.
+        fps: frames a second, instead of what the file says; must be given if the file says nothing.
         axes: what root orientations and translations are expressed in.
-        person: whose motion, where the file has several; the one with most frames if not given.
-        worn: the body that will be worn: betas are fitted to it where the file has only places of joints, and roots
-            turn about its pelvis. A built-in body if not given.
+        person: whose motion to read if the file has several people; by default the one with the most frames.
+        worn: the body that will be dressed: betas are fitted to it if the file has only places of joints, and roots
+            turn about its pelvis. By default a built-in body.
 
     Raises:
-        error: the file can't be read, isn't recognised, has no frame rate, or its arrays have other shapes or meanings.
+        error: the file can't be read, isn't recognised, has no frame rate, or its arrays have wrong shapes or meanings.
     """
     path = Path(path)
     if axes not in AXES or not isinstance(fps, (int, float, type(None))):
@@ -156,7 +156,7 @@ def _recording(
     )
     betas = betas_of(one(layout.betas), n, notes, is_smplx=is_smplx)
     pelvis = PELVIS if worn is None else worn.of(betas.astype(np.float64))[0]
-    is_low = pelvis[1] < (PELVIS + PELVIS_OF_SMPLX)[1] / 2  # one's own body may be SMPL-X's, too
+    is_low = pelvis[1] < (PELVIS + PELVIS_OF_SMPLX)[1] / 2  # the given body may be SMPL-X's, too
     theirs = PELVIS_OF_SMPLX if is_smplx and transl.any() and not is_low else pelvis
     if layout.turns_about_origin:
         transl = transl + turned(theirs, poses[:, 0]) - pelvis
@@ -186,7 +186,7 @@ def _recording(
 
 def _by_time(array: NDArray[Any]) -> NDArray[Any]:
     """Places of joints as (T, n, 3), or of several persons as (N, T, n, 3)."""
-    if array.ndim == 4:  # the time was last: it is first now, and persons are second
+    if array.ndim == 4:  # the time was last: now it is first, and persons are second
         array = array.swapaxes(0, 1)
     if array.ndim == 2 and array.shape[1] % 3 == 0:
         array = array.reshape(len(array), -1, 3)
@@ -208,18 +208,18 @@ def _is_of_places(arrays: Mapping[str, NDArray[Any]]) -> bool:
     return is_alike and len(array) > 0 and are_places(array.astype(np.float64))
 
 
-# Where it is ----------------------------------------------------------------------------------------------------------
+# Where the motion is --------------------------------------------------------------------------------------------------
 
 
 def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Found, list[Mapping[Key, Any]]]:
-    """The mapping that holds the motion, and those around it from the inside outwards."""
+    """The mapping that holds the motion, and the mappings around it, from the inside outwards."""
     if isinstance(content.root, np.ndarray):
         notes.append("an array without a name: taken as poses")
         bare: dict[Key, Any] = _bare(content.root, notes)
         poses = next(layout for layout in table.LAYOUTS if layout.pose == ("poses",))
         return _Found(poses, (), bare), [bare]
     tracks = frames_of(content)
-    whole = entries(content.root) or {}  # of which a frame rate may stand beside the frames
+    whole = entries(content.root) or {}  # a frame rate may stand here, beside the frames
     if tracks:
         notes.append("the file goes frame by frame: each person's frames are put together")
         content = Content(tracks)
@@ -246,7 +246,7 @@ def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Foun
 
 
 def _spelled(content: Content) -> tuple[Content, Mapping[Key, str]]:
-    """With known names, and which they are, where a pose's are spelled otherwise or have a word before them."""
+    """The content with known names, and which were changed, where a pose's are spelled differently or have a prefix."""
     names = None
     for _, node in content.nodes():
         exact = [one for one in table.LAYOUTS if all(node.get(name) is not None for name in one.pose)]
@@ -258,7 +258,7 @@ def _spelled(content: Content) -> tuple[Content, Mapping[Key, str]]:
 
 
 def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
-    """An array alone: a pose, or the columns of Motion-X."""
+    """An array without a name: a pose, or the columns of Motion-X."""
     if array.ndim == 2 and array.shape[1] == 322:
         notes.append("322 columns: taken as Motion-X's")
         arrays: dict[Key, Any] = {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
@@ -274,7 +274,7 @@ def _person(path: tuple[Key, ...]) -> str:
 
 
 def _persons(arrays: Mapping[str, NDArray[Any]]) -> int:
-    """How many persons the first axis counts (SLAHMR), 0 where there is no such axis."""
+    """How many persons are along the first axis (SLAHMR), 0 where there is no such axis."""
     ways = [3 * n for n in (*WHOLE, *BODY)]
     batched = [array for array in arrays.values() if array.ndim == 3 and array.shape[2] in ways and array.shape[1] > 1]
     batched += [array for array in arrays.values() if array.ndim == 4 and array.shape[3] == 3 and array.shape[2] > 3]
@@ -304,11 +304,11 @@ def _unknown(nodes: Mapping[tuple[Key, ...], Mapping[Key, Any]]) -> str:
 
 
 def _first(above: Sequence[Mapping[Key, Any]], names: Sequence[str]) -> Any:
-    """The first of these entries, nearest to the motion."""
+    """The first entry with one of these names, from the mapping nearest to the motion."""
     return next((node[name] for node in above for name in names if node.get(name) is not None), None)
 
 
-# What it means --------------------------------------------------------------------------------------------------------
+# What the arrays mean -------------------------------------------------------------------------------------------------
 
 
 def _columns(arrays: Mapping[str, NDArray[Any]]) -> int:
@@ -318,7 +318,7 @@ def _columns(arrays: Mapping[str, NDArray[Any]]) -> int:
 def _poses(
     arrays: Mapping[str, NDArray[Any]], layout: table.Layout, node: Mapping[Key, Any], notes: list[str]
 ) -> NDArray[np.float64]:
-    """SMPL's 24 joints of any layout."""
+    """Rotation vectors of SMPL's 24 joints, from any layout."""
     names, given = list(arrays), list(arrays.values())
     if len(given) == 2:
         root, _ = rotvecs_of(given[0], names[0], (1,), notes, has_root=True)

@@ -1,4 +1,4 @@
-"""One person's recorded motion, and what its rate may be."""
+"""One person's recorded motion, and the limits of its frame rate."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 FPS_RANGE = (1e-3, 10_000.0)
-"""Frames a second that anything is recorded or sampled at: a frame in a quarter of an hour, and ten a millisecond."""
+"""Lowest and highest frame rate of recordings and samples [1/s]: one in a quarter of an hour, and ten a millisecond."""
 MAX_FRAMES = 1_000_000
-"""Of a clip: nine hours at 30 Hz."""
+"""Most frames of a clip: nine hours at 30 Hz."""
 FASTEST, _FARTHEST = 12.0, 50.0
-"""What people run [m/s], and how far from its origin a recording shows them [m]; in centimetres everybody is beyond."""
+"""The fastest that people run [m/s], and the farthest they get from a recording's origin [m]. Translations in
+centimetres exceed it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One person moving, sampled evenly, in SMPL's axes (y up) unless they were to be left as they are."""
+    """One person moving, sampled evenly, in SMPL's axes (y up) unless the reader was told to keep the file's axes."""
 
     poses: NDArray[np.float32]
-    """Rotation vectors of SMPL's joints [rad], shape (T, 24, 3); recordings do have frames that aren't finite."""
+    """Rotation vectors of SMPL's joints [rad], shape (T, 24, 3); real recordings have frames that aren't finite."""
     transl: NDArray[np.float64]
     """Translations [m], shape (T, 3)."""
     betas: NDArray[np.float32]
@@ -30,11 +31,11 @@ class Recording:
     fps: float
     """Frames a second."""
     gender: str = "neutral"
-    """male, female or neutral: whose shape space the betas are of."""
+    """male, female or neutral: which shape space the betas belong to."""
     notes: tuple[str, ...] = field(default=())
-    """What was taken for granted, left out or turned: a sentence each, to be shown to whoever gave the file."""
+    """What was assumed, left out or turned: one sentence each, to be shown to whoever supplied the file."""
     is_fitted: bool = False
-    """Whether the betas were fitted to the body that will be worn, and are its own."""
+    """Whether the betas were fitted to the body that will be dressed, and so are in its own shape space."""
 
 
 def check_fps(fps: float) -> float:
@@ -47,7 +48,7 @@ def check_fps(fps: float) -> float:
 
 
 def n_resampled(n: int, fps: float, wanted: float) -> int:
-    """Frames that `n` frames at `fps` become at the rate `wanted`. Raises `ValueError` for more than `MAX_FRAMES`."""
+    """How many frames `n` at `fps` become at the rate `wanted`. Raises `ValueError` for more than `MAX_FRAMES`."""
     count = int((n - 1) / fps * check_fps(wanted) + 1e-9) + 1
     if count > MAX_FRAMES:
         msg = f"{n} frames at {fps:g} Hz are {count} at {wanted:g} Hz, at most {MAX_FRAMES} are made; cut the clip"
@@ -58,10 +59,10 @@ def n_resampled(n: int, fps: float, wanted: float) -> int:
 def interpolated(
     poses: NDArray[np.floating], transl: NDArray[np.floating], at: NDArray[Any], wanted: NDArray[Any]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Motion that is known `at` times (T,), ascending, at the `wanted` times (N,) between them.
+    """Motion at the `wanted` times (N,), between the ascending times `at` (T,) for which it is known.
 
-    Rotations are taken on the shorter arc and translations along straight lines, of poses (T, J, 3) [rad] and transl
-    (T, 3) [m]. Components of rotation vectors aren't interpolated: they may jump by 2 pi between frames.
+    Poses (T, J, 3) [rad] are interpolated on the shorter arc, and transl (T, 3) [m] along straight lines. Components of
+    rotation vectors aren't interpolated one by one: they may jump by 2 pi between frames.
     """
     if len(at) == 1:
         n = len(wanted)
@@ -71,12 +72,12 @@ def interpolated(
 
 
 def not_finite(poses: NDArray[np.floating], transl: NDArray[np.floating]) -> NDArray[np.intp]:
-    """The numbers of the frames with NaN or infinity, of poses (T, J, 3) and transl (T, 3)."""
+    """The numbers of the frames in which poses (T, J, 3) or transl (T, 3) have NaN or infinity."""
     return np.flatnonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(transl).all(axis=1)))
 
 
 def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> None:
-    """Adds a note where translations (T, 3) [m] at so many frames a second can't be of a person, and in metres."""
+    """Adds a note if translations (T, 3) [m], at `rate` frames a second, can't be a person's in metres."""
     with np.errstate(over="ignore", invalid="ignore"):
         steps, away = np.linalg.norm(np.diff(transl, axis=0), axis=1), np.linalg.norm(transl, axis=1)
     steps, away = steps[np.isfinite(steps)], away[np.isfinite(away)]

@@ -1,4 +1,4 @@
-"""Rotations as files have them: vectors, matrices, or six numbers; seen by an array's shape, checked by its numbers."""
+"""Rotations as files have them: vectors, matrices, or six numbers; recognised by shape, checked by value."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 Array = NDArray[np.float64]
 
 WHOLE = (24, 22, 52, 55)
-"""Joints of SMPL, of its body without hands, of SMPL-H, of SMPL-X; with the root."""
+"""Numbers of joints, root included: of SMPL, of its body without hands, of SMPL-H, of SMPL-X."""
 BODY = (23, 21, 51, 54)
-"""The same without it."""
+"""The same without the root."""
 _FORMS = {3: "rotation vectors", 9: "matrices", 6: "6D rotations", 4: "quaternions"}
 LONGEST_TURN = 2 * np.pi + 0.1
-"""A vector that was unwrapped may be so long [rad], and no median of sound ones is longer."""
-_MOST_SKEW = 0.05  # of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
+"""An unwrapped rotation vector may be this long [rad]; the median of sound ones is never longer."""
+_MOST_SKEW = 0.05  # largest entry of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
 _MOST_UNEVEN = 0.3  # mean deviation of raw network output from two orthonormal vectors; anything else has 0.5 at least
 
 
@@ -50,7 +50,7 @@ def rotvecs_of(
 
 
 def is_one_frame(shape: tuple[int, ...], counts: Collection[int]) -> bool:
-    """Whether an array of this shape is one frame of so many joints, in whichever form."""
+    """Whether an array of this shape is one frame of one of these numbers of joints, in any form."""
     while len(shape) > 1 and shape[0] == 1:
         shape = shape[1:]
     forms = {(n, *form) for n in counts for form in ((3,), (6,), (9,), (3, 3))}
@@ -59,7 +59,7 @@ def is_one_frame(shape: tuple[int, ...], counts: Collection[int]) -> bool:
 
 
 def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int, int, int]:
-    """Numbers a joint, joints, frames."""
+    """Numbers per joint, number of joints, number of frames."""
     if array.dtype.kind != "f":
         msg = f"{name} must be numbers with a fraction, got {array.dtype} {array.shape}"
         raise ValueError(msg)
@@ -84,7 +84,7 @@ def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int,
             f"(T, n, 6) or (T, n*6), with T > 0 and n = {per} joints, got {shape}"
         )
         raise ValueError(msg)
-    # (24, 3) is a frame of SMPL; as 24 frames of a root it would have been asked for with the count 1.
+    # (24, 3) is one frame of SMPL: for 24 frames of a root, the caller would have asked for the count 1.
     return next((form for form in found if form[0] != 4), found[0])
 
 
@@ -101,7 +101,7 @@ def _check_radians(vectors: Array, name: str) -> None:
 
 
 def _rotvecs(matrices: Array, name: str) -> Array:
-    """Rotation vectors of matrices (T, n, 3, 3); a frame with one that is not finite, or all zero, becomes NaN."""
+    """Rotation vectors of matrices (T, n, 3, 3); a frame in which one isn't finite, or is all zero, becomes NaN."""
     result = np.full((*matrices.shape[:2], 3), np.nan)
     there = np.isfinite(matrices).all(axis=(1, 2, 3)) & (np.abs(matrices).max(axis=(2, 3)) > 0).all(axis=1)
     sound = matrices[there]
@@ -126,10 +126,10 @@ def _rotvecs(matrices: Array, name: str) -> Array:
 
 
 def _of_six(six: Array, name: str, notes: list[str], *, first: int) -> Array:
-    """Matrices (T, n, 3, 3) of two of their rows or columns, shape (T, n, 6); `first` is the number of joint 0.
+    """Matrices (T, n, 3, 3) from two of their rows or columns, shape (T, n, 6); `first` is SMPL's number of joint 0.
 
-    Three orders are in use. Interleaved columns show by their numbers. Rows and columns are each other's inverses, and
-    knees and elbows bend one way only.
+    Three orders are in use. Interleaved columns are recognised by their numbers. Rows and columns give inverse
+    rotations; they are told apart because knees and elbows bend one way only.
     """
     pairs = {"interleaved columns": (six[..., 0::2], six[..., 1::2]), "halves": (six[..., :3], six[..., 3:])}
     with np.errstate(over="ignore", invalid="ignore"):
@@ -157,7 +157,7 @@ def _unevenness(a: Array, b: Array) -> float:
 
 
 def _completed(a: Array, b: Array) -> Array:
-    """Matrices whose first two columns are nearest to a and b, shapes (..., 3), by Gram and Schmidt."""
+    """Matrices whose first two columns are nearest to a and b, shapes (..., 3), by Gram-Schmidt."""
     tiny = 1e-12
     x = a / np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), tiny)
     b = b - (x * b).sum(axis=-1, keepdims=True) * x
@@ -166,7 +166,7 @@ def _completed(a: Array, b: Array) -> Array:
 
 
 def _flexion(matrices: Array, first: int) -> float:
-    """How far knees and elbows bend the way they can [rad], all together, on average."""
+    """How far knees and elbows bend the way they can [rad], averaged over frames and summed over joints."""
     n, total = matrices.shape[1], 0.0
     for joint, axis, sign in ((4, 0, 1), (5, 0, 1), (18, 1, -1), (19, 1, 1)):
         if 0 <= joint - first < n:

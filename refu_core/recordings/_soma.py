@@ -1,7 +1,7 @@
 """SOMA: a body that isn't SMPL's, but whose files turn its joints about the axes of a T-pose, as SMPL's do.
 
-So a joint's turns are those of SMPL's joint in its place, and where SMPL has one joint for two they are put together.
-Nothing of SOMA's own package or model is needed.
+So each of SMPL's joints takes the turns of SOMA's joint in the same place. Where SMPL has one joint for two of SOMA's,
+their turns are composed. Nothing of SOMA's own package or model is needed.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _SMPL = ("smpl", "smplh", "smplx")
 
 
 def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]) -> Content:
-    """A file of SOMA as one of SMPL, whose pelvis (3,) is there at rest [m]; any other as it is.
+    """A SOMA file as one of SMPL, whose pelvis at rest is at `pelvis` (3,) [m]; any other file stays as it is.
 
-    Raises `ValueError` for one without the body's joints, or whose turns aren't about the axes of the T-pose.
+    Raises `ValueError` for a SOMA file without the body's joints, or whose turns aren't about the axes of the T-pose.
     """
     root = content.root
     if not isinstance(root, dict) or any(root.get(name) is None for name in ("poses", SOMA_NAMES)):
@@ -51,7 +51,7 @@ def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]
     if unit not in _METRES:
         msg = f"unit: wanted {', '.join(_METRES)}, got {unit[:20]!r}"
         raise ValueError(msg)
-    if root.get("transl") is not None:  # where SOMA's hips are: SMPL's is added to the pelvis at rest
+    if root.get("transl") is not None:  # SOMA's is the place of the hips; SMPL's is added to the pelvis at rest
         transl = content.array(root["transl"])
         is_place = transl.dtype.kind in "iuf" and transl.shape[-1:] == (3,)
         found["transl"] = _METRES[unit] * transl - pelvis if is_place else transl
@@ -65,7 +65,7 @@ def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]
 
 
 def _together(turns: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """One joint's rotation vectors [rad], (T, 3), for those of several, from the root outwards."""
+    """One joint's rotation vectors [rad], (T, 3), composed of those of several, from the root outwards."""
     if len(turns) == 1:
         return turns[0]
     sound = np.isfinite(turns).all(axis=(0, 2))

@@ -1,4 +1,4 @@
-"""Which way is up: seen from the people, who stand most of the time."""
+"""Which way is up, judged by the people, who stand most of the time."""
 
 from __future__ import annotations
 
@@ -14,47 +14,47 @@ Array = NDArray[np.float64]
 
 Axes = Literal["auto", "smpl", "z-up", "y-down", "frame"]
 """What root orientations and translations are expressed in: `smpl` (y up), `z-up` (AMASS, ROS), `y-down` (a camera's
-optical frame). `auto` sees it from the people; `frame` leaves the numbers as they are, whatever they mean."""
+optical frame). `auto` judges by the people; `frame` leaves the numbers as they are, whatever they mean."""
 AXES: tuple[Axes, ...] = get_args(Axes)
 
 PELVIS = np.array([0.0, -0.22, 0.02])
-"""SMPL's pelvis at rest [m], shape (3,): within 5 mm that of the built-in bodies, whatever the betas. The root turns
-about it, and a translation is added afterwards."""
+"""SMPL's pelvis at rest [m], shape (3,), within 5 mm of the built-in bodies' for any betas. The root turns about it,
+and a translation is added afterwards."""
 PELVIS_OF_SMPLX = np.array([0.003, -0.351, 0.012])
-"""SMPL-X's [m], shape (3,), of the neutral mean shape, as open projects' tables of its joints have it."""
+"""SMPL-X's pelvis [m], shape (3,), for the neutral mean shape, from open projects' tables of its joints."""
 _TURNS: dict[str, Array] = {
-    "z-up": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),  # as vertices_smpl_from_ros: in ROS axes nothing changes
+    "z-up": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),  # as vertices_smpl_from_ros, so nothing changes in ROS axes
     "y-down": np.diag([1.0, -1, -1]),
 }
 _CLEAR = 0.6
-"""Length that the mean of the up vectors has along an axis, at least, for that axis to be up: people who walk, reach
-and squat have 0.9 and more, and a quarter of a clip on the floor leaves 0.7."""
+"""An axis is up if the mean of the up vectors is at least this long along it. People who walk, reach and squat have
+0.9 and more; a clip with a quarter of its time on the floor still has 0.7."""
 _LEANS = 0.9
-"""Below it [cosine], on average, a person who should stand leans: the camera is tilted by 26° or more."""
+"""A standing person whose mean cosine to the vertical is below this leans: the camera is tilted by 26° or more."""
 _UP = 0.5
 """Cosine between body and vertical above which a person is upright."""
 
 
 def _are_sound(roots: Array) -> NDArray[np.bool_]:
-    """Whether each can be computed with; NaN can't."""
+    """Which roots are small enough to compute with; NaN isn't."""
     sound: NDArray[np.bool_] = np.abs(roots).max(axis=1) <= MAX_ANGLE
     return sound
 
 
 def up_of_root(roots: Array) -> Array:
-    """Directions from the pelvis upwards, shape (T, 3), of root rotation vectors [rad], shape (T, 3)."""
+    """The body's upward directions, shape (T, 3), for root rotation vectors [rad], shape (T, 3)."""
     up: Array = Rotation.from_rotvec(roots).apply([0.0, 1.0, 0.0])
     return up.reshape(-1, 3)
 
 
 def upright_share(roots: Array) -> float:
-    """Share of frames, 0 to 1, in which a person is upright in SMPL's axes; 1 for none that is finite."""
+    """Share of frames, 0 to 1, in which a person is upright in SMPL's axes; 1 if no frame is finite."""
     roots = roots[_are_sound(roots)]
     return float((up_of_root(roots)[:, 1] > _UP).mean()) if len(roots) else 1.0
 
 
 def axis_of(roots: Array) -> str:
-    """The axis that people stand along, as `+y`; empty where none is clear."""
+    """The axis that people stand along, such as `+y`; empty if none is clear."""
     roots = roots[_are_sound(roots)]
     if not len(roots):
         return ""
@@ -64,12 +64,12 @@ def axis_of(roots: Array) -> str:
 
 
 def upright_turn(roots: Array) -> Array:
-    """The rotation (3, 3) to SMPL's axes from those that people stand in, as far as it shows; the identity if not."""
+    """The rotation (3, 3) to SMPL's axes from the axes that people stand in; the identity if these aren't clear."""
     return _TURNS.get({"+z": "z-up", "-y": "y-down"}.get(axis_of(roots), ""), np.eye(3))
 
 
 def turn_from(up: Array) -> Array:
-    """The rotation (3, 3) to SMPL's axes from those in which `up`, shape (3,), is up; the identity for any other."""
+    """The rotation (3, 3) to SMPL's axes from those in which `up`, shape (3,), is up; the identity if none fits."""
     return next((turn for turn in _TURNS.values() if turn[1] @ up > _CLEAR), np.eye(3))
 
 
@@ -78,7 +78,7 @@ def to_smpl(
 ) -> tuple[Array, Array]:
     """Roots [rad] and translations [m], shapes (T, 3), in SMPL's axes.
 
-    `usual` is what such files mean where it can't be seen, and `pelvis` (3,) [m] what a root turns about.
+    `usual` are the axes of such files where the motion doesn't show them; a root turns about `pelvis` (3,) [m].
     """
     if axes == "frame":
         return roots, transl

@@ -18,7 +18,7 @@ _STEADY = 1e-3  # betas that differ by less between frames are one shape
 
 
 def turned(place: NDArray[np.float64], roots: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where roots (T, 3) [rad] turn a place (3,) to about the mesh's origin [m], shape (T, 3)."""
+    """Where roots (T, 3) [rad] take a place (3,) by turning it about the mesh's origin [m], shape (T, 3)."""
     found = np.full(roots.shape, np.nan)
     sound = np.isfinite(roots).all(axis=1)
     found[sound] = Rotation.from_rotvec(roots[sound]).apply(place)
@@ -26,7 +26,7 @@ def turned(place: NDArray[np.float64], roots: NDArray[np.float64]) -> NDArray[np
 
 
 def transl_of(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: list[str]) -> NDArray[np.float64]:
-    """A translation for each frame [m], shape (n, 3); zeros for none. Raises `ValueError` for another shape."""
+    """A translation for each frame [m], shape (n, 3); zeros if there is none. Raises `ValueError` for another shape."""
     names = " or ".join(name for name in layout.transl if name not in table.ROOT_PLACES)
     if array is None:
         notes.append(f"no translation ({names}): the person stays in one place")
@@ -41,9 +41,9 @@ def transl_of(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: l
 
 
 def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: bool) -> NDArray[np.float32]:
-    """The first 10 coefficients; the mean shape's zeros where there are fewer. A person has one shape: the median.
+    """The first 10 coefficients, with the mean shape's zeros for missing ones. A person has one shape: the median.
 
-    Raises `ValueError` for another shape, and for what isn't finite.
+    Raises `ValueError` for an array of another shape, and for numbers that aren't finite.
     """
     betas = np.zeros(N_BETAS, np.float32)
     if array is None or not array.size:
@@ -69,7 +69,7 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: 
 
 
 def fps_of(content: Content, value: Any) -> float:
-    """Frames a second. Raises `ValueError` for none."""
+    """Frames a second. Raises `ValueError` if there is no such number."""
     if value is None:
         msg = "no frame rate in the file: say it, as in --fps 30 (in Python: fps=30)"
         raise ValueError(msg)
@@ -86,7 +86,7 @@ def fps_of(content: Content, value: Any) -> float:
 
 
 def word_of(content: Content, value: Any, which: int = 0) -> str:
-    """A word of text in any of its disguises."""
+    """A word of text, in any form in which files hold it."""
     if isinstance(value, (list, tuple)) and value:
         value = value[min(which, len(value) - 1)]
     if value is not None and not isinstance(value, (str, bytes)):
@@ -100,7 +100,7 @@ def word_of(content: Content, value: Any, which: int = 0) -> str:
 
 
 def gender_of(word: str, notes: list[str]) -> str:
-    """`male`, `female` or `neutral`, which an unknown word is, too."""
+    """`male`, `female` or `neutral`; an unknown word is neutral, too."""
     if word and word not in GENDERS:
         notes.append(f"the gender {word[:20]!r} isn't known: neutral")
     return GENDERS.get(word, "neutral")

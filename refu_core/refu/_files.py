@@ -1,4 +1,4 @@
-"""The ReFU layer on disk: its tensors lie with the backbone's that it was trained with."""
+"""The ReFU layer on disk: its tensors are stored with those of the backbone that it was trained with."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PREFIX = "refu."
 
 
 def refu_tensors(refu: Refu, *, half: bool = True) -> dict[str, Tensor]:
-    """The layer's tensors by the names they have on disk; beside them the card needs `refu.config` as `refu`."""
+    """The layer's tensors by the names they have on disk; the card must hold `refu.config` as `refu`."""
     return {_PREFIX + name: t.half() if half else t for name, t in refu.state_dict().items()}
 
 
@@ -26,7 +26,7 @@ def trained_from_weights(
     """The backbone and the layer (None where it was trained without) in `weights`, ready for use.
 
     Raises:
-        WeightsError: of another version or garment, or the basis beside them is missing, damaged or another one.
+        WeightsError: they are of another version or garment, or their basis is missing, damaged or the wrong one.
     """
     backbone: Backbone = backbone_from_weights(weights, garment, device=device).requires_grad_(False)
     refu = refu_from_weights(weights, device=device)

@@ -55,13 +55,13 @@ class Refu(nn.Module):
             "scale": None if scale is None else asdict(scale),
             "margin": margin,
         }
-        """What the layer was made with, for a weights' card; `from_config` takes it."""
+        """What the layer was made with, for the card of its weights; `from_config` takes it."""
         self.n_vertices, self.margin = n_vertices, margin
         self.scale = None if scale is None else ScaleNet(n_vertices, least=least, settings=scale)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Refu:
-        """The layer, untrained, that `config` describes. Raises `WeightsError` where that isn't such a description."""
+        """The layer that `config` describes, untrained. Raises `WeightsError` if that isn't such a description."""
         try:
             scale = config["scale"]
             return cls(
@@ -83,7 +83,7 @@ class Refu(nn.Module):
         return 1.0 if self.scale is None or z is None else self.scale.of_body(z)
 
     def forward(self, points: Tensor, sample: SdfSample, z: Tensor | None = None) -> Tensor:
-        """Pushes garments [m], shape (B, N, 3), of which `sample` has distances (B, N) and gradients (B, N, 3).
+        """Pushes garments [m], shape (B, N, 3), whose distances (B, N) and gradients (B, N, 3) `sample` holds.
 
         Args:
             points: Garment vertices [m].

@@ -16,14 +16,14 @@ from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 
 ScaleKind = Literal["vertex", "shared", "distance"]
 VertexScale = Callable[[Tensor, Tensor], Tensor]
-"""α of some vertices of one body: (their numbers (R,), their signed distances [m] (R,)) to (R,)."""
+"""α of some vertices of one body, (R,), from their indices (R,) and their signed distances [m] (R,)."""
 
 N_INPUTS = N_BETAS + 3 * (N_JOINTS - 1) + 3 + N_STYLES
-"""β, the pose without the root, the direction of up as the root sees it, γ."""
+"""Inputs of h: β, the pose without the root, the up direction in the root's frame, γ."""
 _DISTANCE_UNIT = 0.01
-"""g reads distances in cm: so they are about as large as the latent vector that it reads beside them."""
+"""g reads distances in cm, so that they are about as large as the latent vector that it reads with them."""
 _SHARPNESS = 20.0
-"""Of the softplus that keeps α in its range: it starts at 1.03 (least 1) or 1.00 (least 0), with a steep derivative."""
+"""Of the softplus that keeps α in its range. α starts at 1.03 (least 1) or 1.00 (least 0), with a steep derivative."""
 _MAX_SCALE = 100.0
 
 
@@ -55,8 +55,8 @@ SCALE_PRESETS: dict[str, ScaleSettings] = {"paper": PAPER, "realtime": REALTIME}
 class ScaleNet(nn.Module):
     """α_i = g(k(z)_i, f(x_i)) for z = h(β, θ, γ) (Eq. 5, 6).
 
-    k and g are evaluated for the vertices asked for, and no others: in a frame those are the pushed ones, a tenth of
-    the garment. A network that hasn't been trained answers α ≈ 1 everywhere, the paper's fixed scale.
+    k and g are evaluated only for the vertices asked for: in a frame those are the pushed ones, a tenth of the garment.
+    An untrained network gives α ≈ 1 everywhere, the paper's fixed scale.
     """
 
     def __init__(self, n_vertices: int, *, least: float, settings: ScaleSettings = REALTIME) -> None:
@@ -88,7 +88,7 @@ class ScaleNet(nn.Module):
         else:
             latent = 0
         last = nn.Linear(d, 1)
-        # It starts at nothing, so that training starts from the fixed scale and departs from it as far as it pays.
+        # Zeros, so that training starts from the fixed scale and departs from it only as far as that helps.
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.g = nn.Sequential(nn.Linear(latent + 1, d), nn.ReLU(), last)
@@ -115,7 +115,7 @@ class ScaleNet(nn.Module):
         return self._in_range(self.g(inputs)[:, 0])
 
     def _in_range(self, raw: Tensor) -> Tensor:
-        """α of what g says, near 1 where that is near 0."""
+        """α from g's output `raw`, near 1 where that is near 0."""
         # A pose far beyond training may overflow the networks; α = 1 is right to first order.
         usual = 1 - self.least
         bounded = torch.nan_to_num(raw + usual, nan=usual, posinf=_MAX_SCALE, neginf=-_MAX_SCALE)
@@ -128,7 +128,7 @@ class ScaleNet(nn.Module):
         k = self.k if self.settings.kind == "vertex" else None
         if not isinstance(k, _CompactLatent):
             return lambda vertex, distance: self(row, torch.zeros_like(vertex), vertex, distance)
-        # Half the time: z's factor of a compact k goes into g's first layer, once a body.
+        # Takes half the time: z's factor of a compact k is folded into g's first layer, once per body.
         first, bias, last, last_bias = self.g.parameters()
         inputs = torch.cat((k.projection(row), z.new_full((1, 1), 1 / _DISTANCE_UNIT)), dim=1)
         weight = (first * inputs).T
@@ -144,8 +144,8 @@ class ScaleNet(nn.Module):
 def scale_inputs(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
     """What h reads, shape (B, 86), from betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4) or None for the mean one.
 
-    The root's rotation enters as the direction of gravity, which is all of it that a garment can feel; the other
-    rotation vectors with angles up to π, as nobody promises to send them.
+    The root's rotation enters as the direction of gravity, which is all of it that a garment can feel. The other
+    rotation vectors enter with angles up to π: callers may pass larger ones.
     """
     angle = torch.linalg.vector_norm(pose, dim=-1, keepdim=True)
     wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
@@ -156,7 +156,7 @@ def scale_inputs(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
 
 
 class _DenseLatent(nn.Module):
-    """k(z)_i by one dense layer M to N · D, of which the rows of the vertices asked for are multiplied."""
+    """k(z)_i by one dense layer M to N · D, of which only the rows of the vertices asked for are multiplied."""
 
     def __init__(self, m: int, n: int, d: int) -> None:
         super().__init__()
@@ -167,7 +167,7 @@ class _DenseLatent(nn.Module):
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor) -> Tensor:
         if len(z) == 1:
             return functional.relu(self.weight[vertex] @ z[0] + self.bias[vertex])
-        # Of a batch, the vertices that any of the bodies asks for: one product, and each row is read once.
+        # For a batch, one product of all vertices that any of the bodies asks for: each row is read once.
         asked, where = torch.unique(vertex, return_inverse=True)
         latent = torch.einsum("bm,udm->bud", z, self.weight[asked]) + self.bias[asked]
         return functional.relu(latent[body, where])
@@ -180,10 +180,10 @@ class _CompactLatent(nn.Module):
         super().__init__()
         self.embedding = nn.Parameter(torch.empty(n, d))
         self.projection = nn.Linear(m, d)
-        if self.embedding.is_meta:  # where only sizes are tried out, `normal_` makes torch import all of its compiler
+        if self.embedding.is_meta:  # only sizes are wanted here, and `normal_` makes torch import all of its compiler
             return
         nn.init.normal_(self.embedding)
-        # Starts at what all poses have in common.
+        # Starts with latent vectors that are almost the same for all poses.
         nn.init.normal_(self.projection.weight, std=0.1 / math.sqrt(m))
         nn.init.ones_(self.projection.bias)
 

@@ -1,4 +1,4 @@
-"""The repulsive force itself: one push along the gradient, by a scale of the distance to a margin."""
+"""The repulsive force itself: one push along the gradient, by the scaled distance to a margin."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from refu_core.errors import MeshError
 from refu_core.sdf import SdfSample, require_tensor
 
 MAX_DISPLACEMENT = 0.1
-"""No vertex moves further than this [m], however wrong its distance is."""
+"""No vertex moves farther than this [m], however wrong its distance is."""
 
 _UP = (0.0, 1.0, 0.0)
 
@@ -17,14 +17,14 @@ _UP = (0.0, 1.0, 0.0)
 def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, margin: float = 0.0) -> Tensor:
     """ReFU: the points [m], shape (N, 3), with those closer to the body than `margin` moved along the gradient.
 
-    x' = x - α (f(x) - ε) ∇f/|∇f| where f(x) < ε, and x elsewhere: the paper's Eq. 2 to 4, with f - ε in the place of f.
+    x' = x - α (f(x) - ε) ∇f/|∇f| where f(x) < ε, and x elsewhere: the paper's Eq. 2 to 4, with f - ε in place of f.
     Differentiable with respect to the points, the sample and the scale. At f = ε the derivative is that of the outer
     branch.
 
     Args:
         points: Garment vertices [m], shape (N, 3).
-        sample: Signed distance and gradient at the points; the gradient needs no unit length, and up stands in for one
-            that is zero or not finite.
+        sample: Signed distance and gradient at the points; the gradient needn't have unit length, and one that is zero
+            or not finite is replaced by up.
         scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
         margin: ε ≥ 0 [m].
 
@@ -51,7 +51,7 @@ def unit_direction(gradient: Tensor) -> Tensor:
     """∇f/|∇f| (paper, Eq. 3), shape (N, 3); up where that isn't defined. Finite, and so are its derivatives."""
     length = torch.linalg.vector_norm(gradient.detach(), dim=-1, keepdim=True)
     defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
-    # Normalising the stand-in, too, keeps NaN out of the branch that isn't taken and so out of its derivative.
+    # Replacing it before normalising keeps NaN out of the branch that isn't taken, and so out of the derivative.
     usable = torch.where(defined, gradient, gradient.new_tensor(_UP))
     direction: Tensor = usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
     return direction

@@ -42,14 +42,14 @@ def _from_face(points: Tensor, corners: Tensor, feature: Feature) -> SdfSample:
     a, b, c = corners.unbind(1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
     height = ((points - a) * normal).sum(-1)
-    # Within intersecting limbs the side by winding number may not be the normal's; nearer, the two differ by rounding.
+    # Within intersecting limbs the winding number's side may not be the normal's. On the surface rounding decides.
     off_surface = height.detach().abs() > float(ON_SURFACE)
     flip = torch.where(off_surface & (feature.sign * height.detach() < 0), -1.0, 1.0).to(points)
     return SdfSample(flip * height, flip[:, None] * normal)
 
 
 def _from_offset(offset: Tensor, feature: Feature) -> SdfSample:
-    """By what there is from the closest edge or vertex to each point, shape (N, 3)."""
+    """Distance and gradient from the offset of each point from its closest edge or vertex, shape (N, 3)."""
     # On the feature itself a distance has no derivative; the height over it along the pseudo-normal stands in.
     height = (offset * feature.normal).sum(-1)
     touching = torch.linalg.vector_norm(offset.detach(), dim=-1) < float(ON_SURFACE)

@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from refu_core.garments import GarmentTemplate
 
 _SPACING = 0.05
-"""Edge of the cubes of the rest pose that have one guide of each part in them [m]."""
+"""Edge of the cubes in the rest pose that each hold one guide of each part [m]."""
 _CELL = 0.045
 """Edge of the table's cells [m]. A guide is found from its own cell and most of the neighbours: 4 to 6 cm away."""
 _DEPTH = 0.01
 """How far below its face a guide is entered [m]: points inside may be farther from the skin than those that matter
 outside."""
 EXACT_FROM = 0.03
-"""Points deeper than this by their walk are asked exactly [m]. In most frames no cloth is as deep. Where some is, the
-exact query's tree is refitted, for a tenth of what the walks take."""
+"""Points that their walk finds deeper than this are queried exactly [m]. In most frames no cloth is as deep. Where some
+is, the exact query's tree is refitted, for a tenth of what the walks take."""
 
 
 class ApproxSdf(MeshSdf):
@@ -51,12 +51,12 @@ class ApproxSdf(MeshSdf):
 
     A walk begins at a face near the point: the one that the garment's vertex was near before posing (`RestFaces`), or
     the last query's. It goes from face to face while the distance falls. Another part of the body (arm, thigh, trunk)
-    within a few centimetres is walked over, too, from a *guide*: one of its faces, which a table of space names. The
+    within a few centimetres is walked over, too, from a *guide*: one of its faces, which a table over space names. The
     table is filled anew for each pose. A look at the guide's plane rules out most walks that would end no closer. The
     closest end counts.
 
-    A point deep in a limb has several ways out of nearly one length. Walks would end at one of them in a frame and at
-    another in the next, and throw cloth from side to side. The few points of this kind are asked exactly.
+    A point deep in a limb has several ways out of nearly the same length. Walks would end at one of them in one frame
+    and at another in the next, and throw cloth from side to side. The few points of this kind are queried exactly.
 
     So the distance is always that to a face of the posed body: exact, or too large where no walk ended at the closest
     face. Sign, gradient and derivatives are those of `ExactSdf`. Within 2 cm of the skin the mean error is some
@@ -70,7 +70,7 @@ class ApproxSdf(MeshSdf):
     ) -> None:
         """Prepares for poses of `body`, on `device` (by default the body's).
 
-        What a walk says is deeper inside than `exact_from` [m] is asked exactly; infinity leaves it at walks.
+        Points that a walk finds deeper inside than `exact_from` [m] are queried exactly; with infinity none are.
 
         Raises `MeshError` when its faces aren't a closed, consistently oriented surface, or are more than a million.
         """
@@ -83,7 +83,7 @@ class ApproxSdf(MeshSdf):
         # A GPU isn't waited for to know whether anything is that deep.
         self._is_serial = self.device.type == "cpu"
         faces, rest = body.faces.cpu().numpy(), body.v_template.double().cpu().numpy()
-        # Over one segment the distance mostly falls all the way to the closest face; to another it may rise first.
+        # Within a segment the distance mostly falls all the way to the closest face; towards another it may rise first.
         part = part_of_faces(body.weights.cpu(), body.faces.cpu(), SEGMENTS.values()).int().numpy()
         self._cube = np.floor(rest[faces].mean(1) / _SPACING).astype(np.int64)
         """Which cube of the rest pose each face is in, shape (F, 3)."""
@@ -113,7 +113,7 @@ class ApproxSdf(MeshSdf):
         """As `BodySdf.of_garment`: walks begin where the vertices were near before posing."""
         rest_faces, order = self._rest_faces, self._none
         if self._is_serial:
-            # Points over the same cube of the rest pose in a row: each finds in the cache what the last one read.
+            # Points over one cube of the rest pose follow each other: each finds in the cache what the last one read.
             order = torch.from_numpy(np.lexsort(self._cube[rest_faces(garment.v_template).numpy()].T)).int()
 
         def ask_garment(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
@@ -141,7 +141,7 @@ class ApproxSdf(MeshSdf):
         self._enter((len(self._guide_rows),), self._guide_rows, self._table)
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
-        if near is None:  # nothing is known to be near: the exact query is right, and as slow
+        if near is None:  # no near face is known: the exact query is right, if slow
             near = self._exact_of_pose().closest(points).face
         return self._walk_from(points, near, self._none)
 

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from refu_core.garments import GarmentTemplate
 
 BAND = 0.008
-"""Width of the band on either side of the skin [m]. It must hold the margin that is kept; and a garment's edges must be
-shorter than twice the band for most of them to say that both their ends are on one side."""
+"""Width of the band on either side of the skin [m]. It must be at least the margin that is kept. And most of a
+garment's edges must be shorter than twice the band, to show that both of their ends are on one side."""
 _FEW = 200
 """Fewer points than this are cheaper in a tree than in cells, which all faces of the body have to look through."""
 _N_ROWS = int(ROWS_X) * int(ROWS_Z)
@@ -56,9 +56,9 @@ class BandSdf(MeshSdf):
     inside is ever taken for one outside, whatever the pose: nothing is carried over from the last frame.
 
     Where the body runs into itself, "inside" is what the pseudo-normal says, as for `ExactSdf`, and not continuous. A
-    vertex deep in one thigh may be outside of the other's skin, which is buried there, and be reached from it. So what
-    is reached from both sides is asked in the tree, and so are pieces of fewer than some hundred vertices: what a limb
-    encloses is small, and the outside of a worn garment hangs together.
+    vertex deep in one thigh may be outside the other's skin, which is buried there, and be reached from that skin. So
+    vertices that are reached from both sides are asked in the tree. So are pieces of fewer than a few hundred vertices:
+    what a limb encloses is small, and the outside of a worn garment is connected.
     """
 
     def __init__(self, faces: Tensor | NDArray[Any], *, band: float = BAND, rest: Tensor | None = None) -> None:
@@ -98,10 +98,10 @@ class BandSdf(MeshSdf):
         is_asked = state == int(ASKED)
         is_asked[patches] = True
         if self._ask_tree(where, found, is_asked):
-            # One of a patch that nothing reaches was asked; if it is inside, so may be all of them.
+            # One vertex of each patch that nothing reaches was asked; if it is inside, all of the patch may be.
             is_patch = torch.isin(state, state[patches][found.distance[patches] < 0])
             self._ask_tree(where, found, is_patch & ~is_asked)
-            # Farther out than the band a distance is clipped where it happens to be known, too.
+            # Beyond the band a distance is clipped even where it happens to be known.
             found.distance.clamp_(max=self.band)
         return found.sample()
 
@@ -140,7 +140,7 @@ class BandSdf(MeshSdf):
         return found
 
     def _ask_tree(self, points: Tensor, found: Found, is_asked: Tensor) -> bool:
-        """Replaces those of the answers that are asked for by the tree's, and says whether there are any."""
+        """Replaces the answers that `is_asked` marks by the tree's, and says whether there are any."""
         any_asked = bool(is_asked.any())
         if any_asked:
             self.skin()  # fits the tree to the pose
@@ -174,7 +174,7 @@ class Scan:
         self._room = 0
 
     def __call__(self, points: Tensor, *, beyond: float) -> Found:
-        """What is closest to each point (N, 3) within the band; face -1 and the distance `beyond` where nothing is."""
+        """The closest face to each point (N, 3) within the band; where none is, face -1 and the distance `beyond`."""
         n = len(points)
         if n > self._room:
             self._make_room(max(n, 2 * self._room))

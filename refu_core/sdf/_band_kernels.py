@@ -1,9 +1,9 @@
 """Closest faces within a band of the skin: the points lie in cells, the faces look for them there. For one CPU core.
 
-Cells are those of a grid that repeats itself after 128 × 64 × 64 of them, so that no place is outside of it and
-nothing is sized by a pose; two places that share a cell cost a test and change no answer. They are kept by rows along
-y: one word says which of a row's 64 cells hold a point, since most of what a face passes is empty and is passed a row
-at a time, and the points lie sorted by row and cell, so that what a face sees of a row is read in one go.
+The grid repeats itself after 128 × 64 × 64 cells, so no place is outside it and no size depends on the pose. Two
+places that share a cell cost a test and change no answer. Cells are kept in rows along y, and one word says which of a
+row's 64 cells hold a point: most of what a face passes is empty, and is passed a row at a time. The points are sorted
+by row and cell, so what a face sees of a row is read in one go.
 """
 
 import warp as wp
@@ -26,9 +26,9 @@ ASKED = wp.constant(2)  # may be inside: must be asked
 OUTSIDE = wp.constant(3)  # of a large piece with vertices of the band, which are outside
 UNREACHED = wp.constant(4)  # 4 + number of its patch
 _SMALL = wp.constant(256)
-"""Vertices of a piece that isn't taken at its word. What a worn garment has outside hangs together, or nearly."""
+"""A piece of up to this many vertices isn't trusted. The outside of a worn garment is connected, or nearly."""
 
-_MOST_CELLS = wp.constant(1.0e9)  # farther from the origin a cell's number would overflow; far means far there
+_MOST_CELLS = wp.constant(1.0e9)  # farther from the origin a cell's number would overflow, so it is clamped
 
 
 @wp.func
@@ -79,7 +79,7 @@ class Cells:
 
 @wp.kernel
 def sort_kernel(cells: Cells, points: wp.array[wp.vec3], sizes: wp.array[int]) -> None:
-    """Sorts the first `sizes[0]` points into cells, in place of the last; `sizes[1]` becomes the number of rows."""
+    """Sorts the first `sizes[0]` points into cells, replacing the last ones; `sizes[1]` becomes the number of rows."""
     for r in range(sizes[1]):
         cells.number_of_row[cells.rows[r]] = -1
     n = sizes[0]
@@ -126,7 +126,7 @@ def sort_kernel(cells: Cells, points: wp.array[wp.vec3], sizes: wp.array[int]) -
 
 @wp.func
 def beyond(x: float, low: float, high: float) -> float:
-    """How far x is outside of an interval; without a look for NaN, as wp.max has."""
+    """How far x is outside an interval; without the check for NaN that wp.max makes."""
     under = low - x
     over = x - high
     most = wp.where(under > over, under, over)
@@ -165,7 +165,7 @@ def scan_kernel(mesh: PosedMesh, cells: Cells) -> None:
             if r >= 0 and (cells.occupied[r] & mask) != wp.uint64(0):
                 here = cells.start[r, first_cell]
                 end = cells.start[r, wp.min(last_cell, _LAST) + 1]
-                rest = int(0)  # of a row that repeats itself: its beginning
+                rest = int(0)  # points at the row's beginning, as it repeats itself
                 if last_cell > _LAST:
                     rest = cells.start[r, last_cell - _LAST] - cells.start[r, 0]
                 while here < end or rest > 0:
@@ -180,7 +180,7 @@ def scan_kernel(mesh: PosedMesh, cells: Cells) -> None:
                     z = beyond(p[2], box_low[2], box_high[2])
                     beside = x * x + y * y + z * z
                     above = height * height
-                    # Neither its plane nor its box is ever farther than a face.
+                    # A face is never nearer than its plane or its box.
                     if wp.where(above > beside, above, beside) < cells.squared[here]:
                         w, _feature = closest_on_triangle(p, a, b, c)
                         offset = (p - a) - (w[1] * (b - a) + w[2] * (c - a))
@@ -202,7 +202,7 @@ def finish_kernel(
     out_distance: wp.array[float],
     out_gradient: wp.array[wp.vec3],
 ) -> None:
-    """Signed distance and gradient from the closest faces; where there is none, the distance `beyond` and no more."""
+    """Signed distance and gradient from the closest faces; where there is none, only the distance `beyond`."""
     q = wp.tid()
     f = cells.face[cells.slot[q]]
     out_face[q] = f
@@ -218,7 +218,7 @@ def finish_kernel(
 @wp.func
 def is_free(p: wp.vec3, q: wp.vec3, distances: float) -> bool:
     """Whether no skin can lie between two points whose distances to it add up to `distances`."""
-    # The balls around them are free of it, and they overlap; less a hair for rounding.
+    # The balls around them hold no skin, and they overlap; less a hair for rounding.
     way = q - p
     return wp.dot(way, way) < distances * distances * 0.9999
 
@@ -239,8 +239,8 @@ def spread_sides_kernel(
 ) -> None:
     """On which side of the skin the vertices beyond the band are, by way of the garment's edges.
 
-    `patch` lists one of each large patch that no vertex of the band reaches, `sizes[2]` in all. The distance of what is
-    beyond the band is the band.
+    `patch` lists one vertex of each large patch that no vertex of the band reaches, `sizes[2]` in all. Vertices beyond
+    the band have the band as their distance.
     """
     n = sizes[0]
     tail = int(0)
@@ -261,10 +261,10 @@ def spread_sides_kernel(
             other = linked[m]
             if state[other] < 0 and is_free(points[q], points[other], wp.abs(distance[q]) + distance[other]):
                 state[other] = ASKED
-                face[other] = face[q]  # where to begin: it is not far from there
+                face[other] = face[q]  # a face to begin from: it isn't far
                 queue[tail] = other
                 tail += 1
-    # The rest hangs together in pieces.
+    # The rest forms connected pieces.
     patches = int(0)
     for seed in range(n):
         if state[seed] < 0:

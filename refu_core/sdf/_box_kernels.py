@@ -14,7 +14,7 @@ WIDTH = wp.constant(8)
 _FAR = wp.constant(1.0e36)  # [m²]
 _LAST = wp.constant(63)
 _FEW = wp.constant(12)
-"""While no more than this wait, nodes are looked at as they come. Twelve and six levels of seven more have room."""
+"""While no more nodes than this wait, the oldest is next, else the newest. Twelve and six levels of seven more fit."""
 MAX_FACES = 8**6
 
 
@@ -31,16 +31,16 @@ class Boxes:
     """A tree of boxes around the faces of a posed body."""
 
     bounds: wp.array2d[Eight]
-    """Of each node's children: least x, y, z, greatest x, y, z [m]; where there is no child, nothing is within."""
+    """Of each node's children: least x, y, z, greatest x, y, z [m]; where there is no child, the box is empty."""
     order: wp.array[wp.int32]
-    """Faces as they come after the last node; empty where there is no tree."""
+    """Faces in their order after the last node; empty where there is no tree."""
     first: wp.int32
     """Number of the first face."""
 
 
 @wp.func
 def least(a: float, b: float, c: float) -> float:
-    """Without a look for NaN, as wp.min has."""
+    """The least of three, without the check for NaN that wp.min makes."""
     lower = wp.where(b < a, b, a)
     return wp.where(c < lower, c, lower)
 
@@ -112,18 +112,18 @@ def guess(p: wp.vec3, boxes: Boxes) -> int:
 
 @wp.func
 def closest_in_boxes(p: wp.vec3, near: int, boxes: Boxes, mesh: PosedMesh) -> int:
-    """The face closest to p, whatever face is `near`; the nearer that is the sooner it is found.
+    """The face closest to p, whatever face is `near`; the nearer that is, the shorter the search.
 
-    No box is farther from p than what is in it, and a node or face is left out only when its box isn't closer than the
-    closest face so far, or a face when its plane isn't. So what is found is the closest of all but for rounding: of
-    several equally close, `near` or any.
+    No box is farther from p than what is in it. A node or face is left out only when its box, or the face's plane,
+    isn't closer than the closest face so far. So what is found is the closest face of all, but for rounding; of several
+    equally close ones, `near` or any.
     """
     face = near
     _w, _feature, offset = closest_on_face(p, face, mesh.points, mesh.faces)
     squared = wp.dot(offset, offset)
-    if not squared < _FAR:  # of a face without area it isn't a number
+    if not squared < _FAR:  # NaN for a face without area
         squared = _FAR
-    # First come, first served: so a processor is at the next node while it still compares boxes of this one.
+    # First in, first out: so a processor can start on the next node while it still compares boxes of this one.
     queue = _Queue()  # begins with the root
     head = int(0)
     tail = int(1)
@@ -137,7 +137,7 @@ def closest_in_boxes(p: wp.vec3, near: int, boxes: Boxes, mesh: PosedMesh) -> in
         if place < boxes.first:
             gaps = squared_gaps(p, place, boxes)
             for k in range(8):
-                # Written in any case, counted if it is of use: there is nothing to be foreseen.
+                # Always written, but counted only if it is of use: there is no branch to predict.
                 queue[tail & _LAST] = 8 * place + 1 + k
                 tail += wp.where(gaps[k] < squared, 1, 0)
         else:

@@ -23,7 +23,7 @@ class BoxTree:
     def __init__(self, faces: Tensor, rest: Tensor) -> None:
         """For `faces`, int32, shape (F, 3), grouped by where they are in a pose with the vertices `rest` (V, 3) [m].
 
-        What is together there should be so in all poses; it is a matter of speed.
+        Faces that are close together there should be so in all poses; this affects speed alone.
 
         Raises `MeshError` for more faces than it has room for.
         """
@@ -40,7 +40,7 @@ class BoxTree:
         self._bounds = memory(n_above + -(-n // _WIDTH), 6, _WIDTH)
         self._bounds[:, :3], self._bounds[:, 3:] = torch.inf, -torch.inf
         self.boxes: Any = Boxes()
-        """As kernels take them."""
+        """The boxes as kernels take them."""
         self.boxes.bounds = wp.from_torch(self._bounds, dtype=Eight)
         self.boxes.order = as_warp(self._order, wp.int32)
         self.boxes.first = _WIDTH * n_above + 1

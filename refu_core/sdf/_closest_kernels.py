@@ -26,7 +26,7 @@ class PosedMesh:
     across: wp.array2d[wp.int32]
     fan_start: wp.array[wp.int32]
     fan_face: wp.array[wp.int32]
-    """As in `Topology`."""
+    """As in `Connectivity`."""
 
 
 @wp.func
@@ -47,7 +47,7 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> tuple
         return wp.vec3(0.0, 1.0, 0.0), VERTEX + 1
 
     weight_c = ab_ap * ac_bp - ab_bp * ac_ap
-    if weight_c <= 0.0 and ab_ap >= 0.0 and ab_bp <= 0.0 and ab_ap > ab_bp:  # else a and b are one
+    if weight_c <= 0.0 and ab_ap >= 0.0 and ab_bp <= 0.0 and ab_ap > ab_bp:  # otherwise a and b coincide
         t = ab_ap / (ab_ap - ab_bp)
         return wp.vec3(1.0 - t, t, 0.0), EDGE
 
@@ -75,7 +75,7 @@ def closest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> tuple
 
 @wp.func
 def area_normal(face: int, points: wp.array[wp.vec3], faces: wp.array2d[int]) -> wp.vec3:
-    """A face's normal, of twice its area."""
+    """A face's normal, as long as twice its area."""
     a = points[faces[face, 0]]
     return wp.cross(points[faces[face, 1]] - a, points[faces[face, 2]] - a)
 
@@ -145,7 +145,7 @@ def is_below(offset: wp.vec3, face: int, feature: int, mesh: PosedMesh) -> bool:
     below = bool(True)
     above = bool(True)
     if feature >= VERTEX and feature < EDGE:
-        # Mostly all faces around a vertex say the same, and their angles there needn't be known.
+        # Mostly all faces around a vertex agree, and their angles there needn't be known.
         vertex = mesh.faces[face, feature - VERTEX]
         for i in range(mesh.fan_start[vertex], mesh.fan_start[vertex + 1]):
             normal = area_normal(mesh.fan_face[i], mesh.points, mesh.faces)
@@ -162,9 +162,9 @@ def is_below(offset: wp.vec3, face: int, feature: int, mesh: PosedMesh) -> bool:
 def distance_and_gradient(
     offset: wp.vec3, face: int, feature: int, normal: wp.vec3, mesh: PosedMesh
 ) -> tuple[float, wp.vec3]:
-    """Signed distance and its unit gradient from the offset of the closest point, which is on a feature of a face.
+    """Signed distance and its unit gradient from the offset from the closest point, which is on a feature of a face.
 
-    In a face's interior any point's offset will do. `normal` is the face's, of unit length.
+    In the face's interior the offset from any of its points will do. `normal` is the face's, of unit length.
     """
     if feature == FACE:
         return wp.dot(offset, normal), normal
@@ -211,7 +211,7 @@ def closest_kernel(
     p = queries[i]
     limit = max_distance[0]
     if near.shape[0] > 0 and near[i] >= 0:
-        # More by what rounding may come to, here and in the tree.
+        # Plus what rounding may amount to, here and in the tree.
         rounding = 1.0e-5 * (1.0 + wp.length(p))
         limit = wp.min(limit, 1.0001 * distance_to_face(p, near[i], mesh) + rounding)
     if by_winding:

@@ -10,7 +10,7 @@ from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
 
 BLOCK = wp.constant(8)
-"""Faces that look for others together."""
+"""How many faces search for others together."""
 if TYPE_CHECKING:
     Corners = wp.Matrix[float]
 else:
@@ -18,8 +18,8 @@ else:
 
 FLOAT0 = wp.constant(wp.float64(0.0))
 APART = wp.constant(wp.float64(1e-9))
-"""Triangles on one side of the other's plane, by more than this [m], don't meet, whatever is rounded: computed heights
-are off by some 1e-15 m."""
+"""A triangle on one side of another's plane by more than this [m] doesn't meet it, whatever is rounded: computed
+heights are off by some 1e-15 m."""
 
 
 @wp.func
@@ -37,8 +37,8 @@ def shared_corner(i: int, j0: int, j1: int, j2: int) -> int:
 def pierces(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> bool:
     """Whether segment ab meets triangle pqr; touching counts, lying in its plane doesn't.
 
-    The line's side of each of the triangle's edges is the sign of a volume that changes its sign, and nothing else,
-    when the edge is traversed the other way: a segment can't slip between two triangles that share an edge.
+    On which side of a triangle's edge the line passes is the sign of a volume. Traversing the edge the other way
+    changes the sign and nothing else: a segment can't slip between two triangles that share an edge.
     """
     normal = wp.cross(q - p, r - p)
     height_a = wp.dot(normal, a - p)
@@ -56,8 +56,10 @@ def pierces(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> 
 
 @wp.func
 def is_beside(normal: wp.vec3d, origin: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> bool:
-    """Whether triangle pqr is on one side of a plane for certain: most pairs whose boxes overlap are, of one or the
-    other."""
+    """Whether triangle pqr is on one side of a plane for certain.
+
+    In most pairs whose boxes overlap, one triangle is on one side of the other's plane.
+    """
     least = APART * (wp.abs(normal[0]) + wp.abs(normal[1]) + wp.abs(normal[2]))
     height_p = wp.dot(normal, p - origin)
     height_q = wp.dot(normal, q - origin)
@@ -103,7 +105,7 @@ def meeting_edges(
         if n_shared > 1:
             return 0
         if n_shared == 1:
-            # Opposite corner k lies edge (k + 1) % 3.
+            # Edge (k + 1) % 3 is opposite corner k.
             own = wp.where(s0 >= 0, 2, wp.where(s1 >= 0, 4, 1))
             corner = wp.max(s0, wp.max(s1, s2))
             tested = own + wp.where(corner == 0, 16, wp.where(corner == 1, 32, 8))

@@ -25,7 +25,7 @@ Sign = Literal["normal", "winding"]
 
 
 class ClosestPoints(NamedTuple):
-    """Where on the body some points are closest to it."""
+    """Where the body is closest to each of some points."""
 
     face: Tensor
     """Body face, int32, shape (N,); -1 where none lies within the distance asked for."""
@@ -92,14 +92,14 @@ class ExactSdf(MeshSdf):
         self._ask = Repeated(closest_kernel, kinds, [self._mesh.id, self._posed, self._by_winding])
 
     def _has_drifted(self) -> bool:
-        # A GPU would have to be waited for to know, and hides a loose tree better.
+        # A GPU would have to be waited for to know this, and it hides the cost of a loose tree better.
         if self.device.type != "cpu" or self._points is None or self._rebuild_distance == math.inf:
             return False
         return float((self._points - self._built_at).abs().max()) > self._rebuild_distance
 
     @property
     def mesh_id(self) -> int:
-        """The body as kernels of one's own take it (`wp.uint64`). Raises `MeshError` before the first `update`."""
+        """The body as custom kernels take it (`wp.uint64`). Raises `MeshError` before the first `update`."""
         self._require_update()
         return int(self._mesh.id)
 
@@ -111,7 +111,7 @@ class ExactSdf(MeshSdf):
     def closest(self, points: Tensor, *, max_distance: float = math.inf, near: Tensor | None = None) -> ClosestPoints:
         """The closest point of the body to each of `points` [m], shape (N, 3), where one is within `max_distance` [m].
 
-        `near`, integers of shape (N,), may name a body face near each point, or -1: then less is looked at.
+        `near`, integers of shape (N,), may name a body face near each point, which makes the search shorter, or be -1.
 
         Not differentiable; raises as `query`.
         """

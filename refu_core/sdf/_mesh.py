@@ -34,12 +34,12 @@ class Found(NamedTuple):
     """Unit gradient, shape (N, 3)."""
 
     def sample(self) -> SdfSample:
-        """The same as a sample."""
+        """The same as an `SdfSample`."""
         return SdfSample(self.distance, self.gradient, self.face)
 
 
 _FARTHEST = 1e7
-"""Largest coordinate [m]: as far as a body may be moved. Fourth powers of it are numbers still."""
+"""Largest coordinate [m], so how far away a body may be. Its fourth power doesn't overflow yet."""
 FOUND = (wp.int32, wp.float32, wp.vec3)
 """The fields' types, as `Repeated` takes them."""
 
@@ -75,7 +75,7 @@ class MeshSdf(ABC):
         self._skin: Any = None
 
     def update(self, vertices: Tensor, *, pose: Tensor | None = None, betas: Tensor | None = None) -> None:
-        """Takes over a new pose: `vertices` [m], shape (V, 3). What it was posed by isn't needed here.
+        """Takes over a new pose: `vertices` [m], shape (V, 3). `pose` and `betas` aren't needed here.
 
         Raises `MeshError` for a wrong shape, values that aren't finite, or a body turned inside out.
         """
@@ -130,9 +130,9 @@ class MeshSdf(ABC):
         return kind, barycentrics, normal
 
     def skin(self) -> Any:
-        """The posed body for kernels of one's own, as `refu_core.sdf.Skin`. Raises `MeshError` before `update`.
+        """The posed body for custom kernels, as `refu_core.sdf.Skin`. Raises `MeshError` before `update`.
 
-        The same one for all poses, until the memory that it names is another.
+        It is the same one for all poses, until the memory that it refers to is replaced.
         """
         self._require_update()
         if self._skin is None:
@@ -162,7 +162,7 @@ class MeshSdf(ABC):
             msg = f"near must be integers of the shape ({n},), got {got}"
             raise MeshError(msg)
         near = near.to(device=self.device, dtype=torch.int32).contiguous()
-        # Clamped and not checked: a device would have to be waited for, and no kernel may read beyond the faces.
+        # Clamped, as a check would wait for the device, and no kernel may read beyond the faces.
         return near.clamp(least, len(self.faces) - 1)
 
     def _require_update(self) -> Tensor:
@@ -203,7 +203,7 @@ def require_finite(name: str, values: Tensor) -> None:
         return  # a CUDA graph can't wait for the answer; what it replays was checked where it came in
     if not len(values):
         return
-    largest = float(values.detach().abs().max())  # NaN as soon as one is; as quick as a sum
+    largest = float(values.detach().abs().max())  # NaN if any value is; as quick as a sum
     if not math.isfinite(largest):
         bad = int((~torch.isfinite(values)).any(dim=-1).sum())
         msg = f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates"

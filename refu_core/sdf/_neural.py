@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _CONDITION = N_BETAS + 3 * (N_JOINTS - 1)
 _MOST_LAYERS = 64
-_CHUNK = 4096  # points whose activations are held at a time where none are kept: 150 MB of the paper's
+_CHUNK = 4096  # points whose activations are held at a time without a graph: 150 MB for the paper's
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class SdfNetworkConfig:
     skip: int = 4
     """Layer whose input is joined by the query point."""
     sharpness: float = 100.0
-    """β of the softplus, which is a ReLU for large ones."""
+    """β of the softplus, which nears a ReLU as β grows."""
     radius: float = 0.5
-    """Of the sphere that an untrained network is the distance to [m]."""
+    """Radius of the sphere that an untrained network is the distance to [m]."""
 
     def __post_init__(self) -> None:
-        """Raises `WeightsError` for sizes of which there is no network."""
+        """Raises `WeightsError` for sizes that make no network."""
         if self.width < 1 or not 0 < self.skip < self.hidden or not (self.sharpness > 0 and self.radius > 0):
             msg = f"wanted positive sizes and a skip among the hidden layers after the first, got {asdict(self)}"
             raise WeightsError(msg)
@@ -167,8 +167,9 @@ class NeuralSdf:
 
 
 def body_frame(body: SmplBody, pose: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
-    """How the roots of bodies of `pose` (B, 24, 3) and `betas` (B, 10) are turned, (B, 3, 3), and about which points
-    [m], (B, 3): (x - root) @ rotation + root undoes it. A distance doesn't depend on it, so no network need learn it.
+    """Rotations (B, 3, 3) of the roots of bodies of `pose` (B, 24, 3) and `betas` (B, 10), and the roots [m], (B, 3).
+
+    (x - root) @ rotation + root undoes a rotation. A distance doesn't depend on it, so no network need learn it.
     """
     return rotvec_to_rotmat(pose[:, 0]), body.rest_joints(betas.to(body.dtype))[:, 0].to(pose)
 

@@ -49,7 +49,7 @@ class BodySdf(Protocol):
         ...
 
     def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:
-        """The same distance for all vertices of one garment, of which much is known beforehand."""
+        """The same distance for all vertices of one garment, about which much is known beforehand."""
         ...
 
 
@@ -68,7 +68,7 @@ class GarmentSdf(Protocol):
 
 
 def plain_garment_sdf(sdf: BodySdf) -> GarmentSdf:
-    """Of a distance for which one garment is like any other points."""
+    """The `GarmentSdf` of a distance that treats a garment's vertices like any other points."""
 
     def ask(vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:  # noqa: ARG001
         return sdf.query(vertices)
@@ -85,11 +85,11 @@ def query_batch(
     pose: Tensor | None = None,
     betas: Tensor | None = None,
 ) -> SdfSample:
-    """`sdf` of a batch of bodies, each at points of its own; fields lead with (B, N).
+    """Queries `sdf` for a batch of bodies, each at points of its own; the shapes of the fields begin with (B, N).
 
-    Bodies are asked one after the other: derivatives of all are kept, and `sdf` ends at the last one. Of `vertices`
-    (B, V, 3) [m] at `points` (B, N, 3) [m], with `near` faces (N,) for all or (B, N); `pose` (B, 24, 3) [rad] and
-    `betas` (B, 10) are what they were posed by.
+    Bodies are queried one after the other: derivatives of all are kept, and `sdf` is left at the last one. They have
+    `vertices` (B, V, 3) [m] and are queried at `points` (B, N, 3) [m], with `near` faces (N,) for all or (B, N); `pose`
+    (B, 24, 3) [rad] and `betas` (B, 10) are what they were posed by.
     """
     samples = []
     for i, (body, here) in enumerate(zip(vertices, points, strict=True)):

@@ -1,4 +1,4 @@
-"""A posed body as kernels of one's own ask it for distances: whichever way a `MeshSdf` finds the closest face."""
+"""A posed body that custom kernels can query for distances, however its `MeshSdf` finds the closest face."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ from refu_core.sdf._closest_kernels import PosedMesh, distance_to_face, measured
 from refu_core.sdf._walk_kernels import Guides, first_at, walk_from
 
 _UNLIMITED = wp.constant(1e18)
-# A known face's distance is a limit to the closest one's; rounding must not cut that one off.
+# A known face's distance limits the search for the closest one; rounding must not exclude that face.
 _SLACK = wp.constant(1e-6)
 
 
@@ -16,12 +16,12 @@ class Skin:
     """One posed body: `MeshSdf.skin` gives it."""
 
     tree: wp.uint64
-    """Warp's mesh where the closest face is looked for in its tree; 0 where not."""
+    """Warp's mesh, if the closest face is searched for in its tree; otherwise 0."""
     boxes: Boxes
-    """Those where it is looked for; without faces where not."""
+    """The boxes, if it is searched for in these; otherwise without faces."""
     mesh: PosedMesh
     guides: Guides
-    """Where it is walked to."""
+    """The guides, if it is found by walking."""
 
 
 @wp.func
@@ -58,7 +58,7 @@ def query_skin_kernel(
     out_distance: wp.array[float],
     out_gradient: wp.array[wp.vec3],
 ) -> None:
-    """`query_skin` at the queries that are asked, or at all where `is_asked` is empty; `near` has a face of each."""
+    """`query_skin` at the queries that are asked, or at all if `is_asked` is empty; `near` has a face for each."""
     i = wp.tid()
     if is_asked.shape[0] > 0 and not is_asked[i]:
         return

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from refu_core.body import SmplBody
 
 _CELL = 0.015
-"""Edge of the grid's cells [m]: less than the body's longer edges, so a look-up is mostly no face off, or one."""
+"""Edge of the grid's cells [m]: less than the body's longer edges, so a look-up is mostly off by one face at most."""
 _BAND = 2
-"""Cells around the skin whose closest face is asked for; those farther out take that of the nearest such cell."""
+"""Cells around the skin whose closest face is computed; those farther out take that of the nearest such cell."""
 _ROOM = 0.1
 """How far the grid reaches beyond the body [m]; places outside of it are looked up at its border."""
 
@@ -30,8 +30,8 @@ _ROOM = 0.1
 class RestFaces:
     """A grid over the rest pose that names a near body face; built in two tenths of a second, and remembered.
 
-    The face need not be the closest, so one grid of the mean shape does for all shapes. Of a garment vertex t(β, γ) +
-    D it wants the place on the mean shape, without what `GarmentTemplate.rest` adds for β:
+    The face need not be the closest, so one grid of the mean shape does for all shapes. For a garment vertex
+    t(β, γ) + D it needs the place on the mean shape, without what `GarmentTemplate.rest` adds for β:
 
         near = rest_faces.under(unposed, betas, garment.shapedirs)
         sample = approx_sdf.query(posed, near=near)
@@ -47,7 +47,7 @@ class RestFaces:
     def under(self, unposed: Tensor, betas: Tensor, shapedirs: Tensor) -> Tensor:
         """Near body faces, int32 of shape (B, V), of unposed garments [m], shape (B, V, 3), on shapes (B, 10).
 
-        `shapedirs` (V * 3, 10) is how the garment follows β, so what takes it back to the mean shape.
+        `shapedirs` (V * 3, 10) is how the garment follows β, so it also takes the garment back to the mean shape.
         """
         return self(unposed - (betas @ shapedirs.T).view_as(unposed))
 
@@ -62,7 +62,7 @@ class RestFaces:
 
 @lru_cache(maxsize=3)  # every pipeline of one body asks for the same
 def _grid_of(body: SmplBody) -> tuple[list[float], NDArray[np.int32]]:
-    """Least corner [m], and near face of each cell by y, x and z: vertices in a row are mostly about as high."""
+    """Least corner [m], and a near face of each cell by y, x and z: successive vertices are mostly about as high."""
     exact = ExactSdf(body.faces, device=body.device)
     exact.update(body.v_template.float())
     rest, faces = body.v_template.float().cpu(), body.faces.cpu()

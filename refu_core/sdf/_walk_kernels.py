@@ -20,29 +20,29 @@ MAX_PARTS = wp.constant(10)
 ABSENT = wp.constant(15)  # the column of bits
 EMPTY = wp.constant(0x7FFFFFFF)  # also: every part is absent
 
-# An entry is the squared distance of guide and cell's centre in these units a square metre, above the face's bits.
+# An entry is the squared distance from a guide to the cell's centre, UNITS to a square metre, above the face's bits.
 FACE_BITS = wp.constant(20)
 FACE_MASK = wp.constant((1 << 20) - 1)
 UNITS = wp.constant(65536.0)
 MAX_FACES = 1 << 20
-# How far a guide is entered: up to this squared distance, in edges of a cell, between its middle and a cell's centre.
+# A guide is entered in cells whose centre is within this squared distance of its middle, in squared edges of a cell.
 ENTER = wp.constant(2.6)
 
-# No walk takes more steps than this; one over half a body's height does.
+# No walk takes more steps than this; one over half a body's height takes as many.
 MAX_STEPS = wp.constant(64)
-# Other parts than the point's own one matter only within this distance [m].
+# Parts other than the point's own matter only within this distance [m].
 FAR = wp.constant(0.02)
 # A guide is of use only if it is no farther away than the best distance so far plus REACH, the way from a guide to its
 # part's closest face [m], and if its plane is no farther below the point than that distance plus ROOM, the height that
 # the part rises above the plane on the way [m].
 REACH = wp.constant(0.08)
 ROOM = wp.constant(0.01)
-# A guide that only continues the skin below the point is of no use, since a body mostly bends away. It is one that
+# A guide that only continues the skin below the point is of no use, since a body mostly bends away. Such a guide
 # faces the same way, by this cosine, and doesn't rise by more than this above that skin [m].
 ALIKE = wp.constant(0.9)
 RISE = wp.constant(0.005)
 # A point deeper than this below a face [m] may be below other faces as well, as the centre of a sphere is below all of
-# them. So the face's neighbours are looked at, too, unless it is farther than the best so far by more than CLOSER [m].
+# them. So that face's neighbours are looked at, too, unless it is farther than the best so far by more than CLOSER [m].
 DEEP = wp.constant(0.008)
 CLOSER = wp.constant(0.02)
 # A step must shorten the squared distance by more than rounding does, or two faces of one edge take turns.
@@ -57,8 +57,8 @@ class Guides:
     """Two rows a face, half a cache line together: its vertices and its part; the faces across its edges (0, 1),
     (1, 2), (2, 0), and nothing."""
     table: wp.array2d[wp.int32]
-    """A row of sixteen a cell of space, one cache line: by part the guide closest to the cell's centre, and in the last
-    column a bit for each part that has none."""
+    """A row of sixteen, one cache line, for each cell of space: by part the guide closest to the cell's centre, and in
+    the last column a bit for each part that has none."""
     cell: wp.float32
     """Edge of a cell [m]."""
 
@@ -70,7 +70,7 @@ def cell_of(p: wp.vec3, cell: float) -> wp.vec3i:
 
 @wp.func
 def row_of(x: int, y: int, z: int) -> int:
-    """Row of a cell. The table repeats itself in space, at distances at which a body has no second of a part."""
+    """Row of a cell. The table repeats itself in space, at distances at which no part of a body occurs twice."""
     return ((x & 15) << 9) | ((y & 31) << 4) | (z & 15)
 
 
@@ -103,7 +103,7 @@ def enter_guides_kernel(
 ) -> None:
     """Enters guide faces into the cell of a place below them and into its neighbours.
 
-    A guide is its vertices, and its number with the part in the bits above.
+    A guide is given as its vertices, and its face number with the part in the bits above.
     """
     guide = guides[wp.tid()]
     part = guide[3] >> FACE_BITS
@@ -133,11 +133,10 @@ def enter_guides_kernel(
 def walk_under(
     p: wp.vec3, start: int, points: wp.array[wp.vec3], links: wp.array[wp.vec4i]
 ) -> tuple[int, int, wp.vec3, wp.vec3]:
-    """The face that p is above or below, each step over the edge that p is most beyond; or a face of an edge or vertex
-    that p is above or below in their place.
+    """The face that p is above or below, or a face of an edge or vertex that p is above or below instead.
 
-    Also the feature of the face that is closest as far as this walk can tell, -1 where it can't, the barycentrics
-    on an edge, and the face's normal, of twice its area.
+    Each step goes over the edge that p is most beyond. Also gives the feature of the face that is closest, as far as
+    this walk can tell, -1 where it can't; the barycentrics on an edge; and the face's normal, of twice its area.
     """
     face = start
     last = int(-1)
@@ -157,7 +156,7 @@ def walk_under(
         weight_b = -wp.dot(around, ac)
         weight_c = wp.dot(around, ab)
         weight_a = area - weight_b - weight_c
-        # Selections, which a processor needn't guess as it does branches; and wp.min looks for NaN.
+        # Selections, since a processor has to predict branches; and wp.min checks for NaN.
         lowest = wp.where(weight_b < weight_a, weight_b, weight_a)
         edge = wp.where(weight_b < weight_a, 2, 1)
         ahead = wp.where(weight_b < weight_a, beside[2], beside[1])
@@ -168,7 +167,7 @@ def walk_under(
             feature = FACE
             break
         if ahead == last:
-            # Beyond the edge as seen from either face: closest to it, or else to something at one of its ends.
+            # p is beyond the edge as seen from either face: closest to it, or else to something at one of its ends.
             if edge == 0:
                 t = wp.dot(ap, ab) / wp.dot(ab, ab)
                 w = wp.vec3(1.0 - t, t, 0.0)
@@ -188,13 +187,13 @@ def walk_under(
 
 @wp.func
 def descend(p: wp.vec3, start: int, mesh: PosedMesh) -> tuple[int, wp.vec3, int, float]:
-    """The face, and the place on it, from which no neighbouring face is closer to p."""
+    """Walks downhill until no neighbouring face is closer to p; gives that face, and the place on it closest to p."""
     face = start
     w, feature, offset = closest_on_face(p, face, mesh.points, mesh.faces)
     squared = wp.dot(offset, offset)
     for _step in range(MAX_STEPS):
         here = face
-        kind = int(feature)  # of here, whatever comes to be closer while its neighbours are looked at
+        kind = int(feature)  # the feature on `here`; `feature` may change while neighbours are looked at
         first = int(0)
         n = int(1)
         edge = kind - EDGE
@@ -228,7 +227,7 @@ def descend(p: wp.vec3, start: int, mesh: PosedMesh) -> tuple[int, wp.vec3, int,
 def is_of_use(
     guide: int, p: wp.vec3, distance: float, outward: wp.vec3, points: wp.array[wp.vec3], links: wp.array[wp.vec4i]
 ) -> bool:
-    """Whether a walk from another part's guide may end closer to p than p's own skin, whose normal is `outward`, is."""
+    """Whether a walk from another part's guide may end closer to p than p's own skin, whose normal is `outward`."""
     corners = links[2 * guide]
     a = points[corners[0]]
     if wp.length(a - p) >= wp.min(distance, FAR) + REACH:
@@ -257,7 +256,7 @@ def walk_from(p: wp.vec3, near: int, mesh: PosedMesh, guides: Guides) -> tuple[i
     others = int(0)
     above = wp.vec3()
     outward = wp.vec3()
-    # -1 is the walk from `near`. One loop with one call of each function: so a compiler puts them in place.
+    # -1 is the walk from `near`. One loop with one call of each function, so that a compiler inlines them.
     for part in range(-1, MAX_PARTS):
         start = int(near)
         walks = bool(part < 0)
@@ -293,7 +292,7 @@ def walk_from(p: wp.vec3, near: int, mesh: PosedMesh, guides: Guides) -> tuple[i
 
 @wp.func
 def first_at(face: int, feature: int, mesh: PosedMesh) -> int:
-    """Of two faces whose edge is closest the first one: which of them a walk comes to hangs on rounding."""
+    """The first of the two faces if their edge is closest: which of them a walk ends at depends on rounding."""
     if feature >= EDGE:
         return wp.min(face, mesh.across[face, feature - EDGE])
     return face
@@ -311,7 +310,7 @@ def walk_kernel(
     out_distance: wp.array[float],
     out_gradient: wp.array[wp.vec3],
 ) -> None:
-    """What `walk_from` finds for each query, in that order where there is one; as `closest_kernel`'s."""
+    """What `walk_from` finds for each query, in `order` unless that is empty; outputs as `closest_kernel`'s."""
     i = wp.tid()
     if order.shape[0] > 0:
         i = order[i]
@@ -337,7 +336,7 @@ def requery_deep_kernel(
     out_distance: wp.array[float],
     out_gradient: wp.array[wp.vec3],
 ) -> None:
-    """Asks the tree about each query that is deeper than `depth`, by its walk: no farther away than that ended."""
+    """Asks the tree about each query that its walk found deeper than `depth`, no farther away than the walk ended."""
     i = wp.tid()
     far = -out_distance[i]
     if far <= depth:

@@ -1,4 +1,4 @@
-"""How many points are inside a posed body, by the winding number: what collision handling is held against."""
+"""Whether points are inside a posed body, by the winding number: the measure that collision handling is held to."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _N_CELLS = int(CELLS)
 class Winding:
     """The winding numbers of a closed mesh at points, exact for float32 vertices.
 
-    A point is inside where its winding number isn't 0. That is so wherever limbs run into each other, too, and has
-    nothing in common with the signs by which garments are brought off the body, nor with the faces found for that.
+    A point is inside where its winding number isn't 0, also where limbs run into each other. The number has nothing in
+    common with the signs by which garments are brought off the body, nor with the faces found for that.
     """
 
     def __init__(self, faces: Tensor) -> None:
@@ -29,7 +29,7 @@ class Winding:
         mesh.require_closed()
         device = faces.device
         self._body = memory(mesh.n_vertices, 3, device=device)
-        # The first point of each cell, its least distance, and the box of all.
+        # The first point of each cell, the least distance in it, and the box around all points.
         n = 2 * _N_CELLS**2
         self._first = memory(n, dtype=torch.int32, device=device)
         self._farthest_in, self._box = memory(n, device=device), memory(2, 3, device=device)
@@ -52,7 +52,7 @@ class Winding:
     def __call__(self, points: Tensor, wanted: Tensor | None = None) -> Tensor:
         """The winding numbers of points [m], shape (N, 3): int32, (N,). A GPU isn't waited for.
 
-        Where they are `wanted` only if a number on the device, int32 of shape (1,), isn't 0, zeros do else.
+        `wanted`, if given, is int32 of shape (1,) on the device: where it is 0, zeros are returned instead.
         """
         n, device = len(points), self._body.device
         points = points.to(device=device, dtype=torch.float32).contiguous()

@@ -2,7 +2,7 @@
 
 The points are listed by the cells of a grid over x and y, those of the front half apart from those of the back half.
 A point in front looks along +z, one behind along -z, so that most see nothing. Which faces a line crosses is decided
-in double precision, where differences of float32 are exact, and each edge says the same to both of its faces: so no
+in double precision, where differences of float32 are exact. Each edge gives both of its faces the same answer, so no
 line slips between two faces, or crosses both.
 """
 
@@ -34,7 +34,7 @@ def difference(p: wp.vec3, q: wp.vec3) -> wp.vec3d:
 
 @wp.func
 def turns(a: wp.vec3d, b: wp.vec3d) -> int:
-    """How an edge from a to b goes around the z axis, as it passes on the side of -x or +x; each end counts once."""
+    """1 if an edge from a to b passes the z axis at +x towards +y, -1 towards -y, else 0; each end counts once."""
     rises = a[1] <= _ZERO
     if rises == (b[1] <= _ZERO):
         return 0
@@ -60,7 +60,7 @@ def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, half: int) -> int:
 
 @wp.func
 def per_metre_of(grid: wp.array[wp.vec3]) -> wp.vec3:
-    """Cells a metre; a hair fewer than there are, so that the last point is in the last cell."""
+    """Cells per metre; a hair fewer than there are, so that the last point is in the last cell."""
     extent = grid[1] - grid[0]
     cells = wp.static(0.9999 * CELLS)
     return wp.vec3(
@@ -73,11 +73,13 @@ def extent_kernel(
     wanted: wp.array[int],
     each: wp.array[int],
     points: wp.array[wp.vec3],
-    # output, and infinite before
+    # output, which is infinite before
     grid: wp.array[wp.vec3],
 ) -> None:
-    """The corners of the box around the points; `each` points a thread. As all of these kernels it does nothing where
-    `wanted` is 0."""
+    """The corners of the box around the points; `each` points a thread.
+
+    Like all of these kernels it does nothing where `wanted` is 0.
+    """
     if wanted[0] == 0:
         return
     begin = wp.tid() * each[0]
@@ -100,7 +102,7 @@ def bin_kernel(
     following: wp.array[int],
     farthest_in: wp.array[float],
 ) -> None:
-    """Lists the points by cell; `farthest_in` is the least distance of a cell's points before the middle plane."""
+    """Lists the points by cell; `farthest_in` is the least distance of a cell's points from the middle plane."""
     if wanted[0] == 0:
         return
     q = wp.tid()
@@ -160,7 +162,7 @@ def crossings_kernel(
                                 q = int(first[cell])
                                 while q >= 0:
                                     p = points[q]
-                                    # Most points are seen by this to be beyond the face, and few for the rest.
+                                    # Most points are ruled out by this test, and few by those after it.
                                     sees = wp.where(half == 0, p[2] <= box_high[2], p[2] >= box_low[2])
                                     along = p[0] >= box_low[0] and p[0] <= box_high[0]
                                     if sees and along and p[1] >= box_low[1] and p[1] <= box_high[1]:

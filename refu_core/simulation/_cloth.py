@@ -18,19 +18,19 @@ from refu_core.simulation._solver import refresh_points, substep
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 _Contacts = tuple[I32, F32, F32, F32]
-"""Vertices, or both ends of edges; and of each the place on the skin, its normal and its motion in a substep."""
+"""Vertices, or both ends of edges; and for each the place on the skin, its normal and its motion in a substep."""
 
 
 @dataclass(frozen=True)
 class ClothSettings:
-    """Material, contact and solver of the cloth; the values are those that were tuned together."""
+    """Material, contact and solver settings of the cloth; the defaults were tuned together."""
 
     density: float = 0.15
     """Mass of the cloth [kg/m²]."""
     stretch_compliance: float = 1e-7
-    """Of the distance along an edge [m/N]."""
+    """Compliance of the length of an edge [m/N]."""
     bend_compliance: float = 2e-3
-    """Of the distance across an edge [m/N]."""
+    """Compliance of the distance across an edge [m/N]."""
     friction: float = 0.3
     """Coulomb's coefficient between cloth and skin."""
     margin: float = 0.004
@@ -42,30 +42,30 @@ class ClothSettings:
     substep: float = 1 / 2400
     """Time step [s]."""
     substeps: int = 40
-    """Time steps a frame."""
+    """Time steps per frame."""
     refresh: int = 10
-    """Time steps between two looks for contacts."""
+    """Time steps between two searches for contacts."""
     iterations: int = 1
-    """Sweeps over all constraints a time step: more steps of one sweep stretch less than fewer of several."""
+    """Sweeps over all constraints per time step: many steps of one sweep stretch less than fewer steps of several."""
     most_ease: float = 0.15
-    """Share by which an edge may give way freely, for the sake of moving joints."""
+    """Share by which an edge may lengthen freely, so that joints can move."""
     most_crease: float = 0.3
     """Share by which an edge may shorten freely, in the crook of a bent elbow."""
     anchor_stiffness: float = 0.2
     """Share of a waistband's distance from its place on the skin that is closed in one sweep."""
 
 
-_REACH = 0.04  # [m]: how far from the skin a vertex knows its distance
-_NEAR = 0.012  # [m]: closer vertices carry a contact
-_SLIDE = 0.003  # [m]: a contact's tangent plane holds for this far
-_PAIR_REACH = 0.007  # [m]: a vertex this close to another piece of the cloth is watched
-_PAIR_SLACK = 0.003  # [m]: pieces are looked for farther away by this, and then not until a vertex has moved half of it
+_REACH = 0.04  # [m]: a vertex's distance to the skin is known up to this
+_NEAR = 0.012  # [m]: vertices closer than this have a contact
+_SLIDE = 0.003  # [m]: a contact's tangent plane is used until the vertex has moved this far
+_PAIR_REACH = 0.007  # [m]: a vertex this close to another part of the cloth gets a self-contact
+_PAIR_SLACK = 0.003  # [m]: pairs are searched this much farther out, and anew when a vertex has moved half of it
 _MAX_SPEED = 6.0  # [m/s]
-_APART = 10.0  # [m]: pieces of cloth that are this far from each other at rest are no neighbours
+_APART = 10.0  # [m]: separate pieces are taken to be this far apart at rest, so they are never neighbours
 
 
 class _Skin:
-    """Where on the skin each of N points was found closest when it was asked for last."""
+    """The closest place on the skin to each of N points, as of the point's last query."""
 
     def __init__(self, n: int) -> None:
         self.face = np.full(n, -1, np.int32)
@@ -75,14 +75,14 @@ class _Skin:
         self.distance: F32 = np.zeros(n, np.float32)
 
     def stale(self, points: F32) -> I32:
-        """Which of the points (N, 3) must be asked for again: those that have moved too far since the last time."""
+        """Which of the points (N, 3) must be queried again: those that have moved too far since their last query."""
         near, slide = np.float32(_NEAR), np.float32(_SLIDE)
         allowed = np.where(self.distance > near + slide, self.distance - near, slide)
         return np.flatnonzero(_squared_way(points, self.asked_at) > allowed * allowed).astype(np.int32)
 
 
 def _squared_way(points: F32, before: F32) -> F32:
-    """The square of how far each point has gone [m²], shape (N,)."""
+    """The square of the distance that each point has moved [m²], shape (N,)."""
     way = points - before
     squared: F32 = (way * way).sum(1)
     return squared
@@ -96,7 +96,7 @@ class SimulatedCloth:
     ) -> None:
         """A garment of this topology against the body behind `sdf`.
 
-        `piece` (N,) numbers the pieces that it is made of: those keep apart however near they are at rest.
+        `piece` (N,) is the number of each vertex's piece. Pieces stay apart however near they are at rest.
 
         `sdf` must have its BVH built on the same vertices whenever the same drape is simulated, and must not rebuild it
         by itself: the tree decides which of two equally close faces is found, and with it the last bit of the result.
@@ -108,7 +108,7 @@ class SimulatedCloth:
         n = topology.n_vertices
         # Bends first: in each sweep the stiffer edges have the last word.
         ends = np.concatenate((topology.bends, topology.edges))
-        self._ends = ends.astype(np.uint32)  # without a sign no index has to be asked whether it counts from the end
+        self._ends = ends.astype(np.uint32)  # unsigned: no check for indices that count from the end
         compliance = np.repeat(
             (settings.bend_compliance, settings.stretch_compliance), (len(topology.bends), len(topology.edges))
         )
@@ -130,16 +130,16 @@ class SimulatedCloth:
     ) -> None:
         """Puts the cloth at `positions` (N, 3), at rest, with the rest lengths and masses of `rest` (N, 3).
 
-        Where an edge is longer in one of the shapes `eased`, (N, 3) each, it gives way up to there, within limits;
-        where it is shorter in one of `crooks`, down to there.
+        Where an edge is longer in one of the shapes `eased`, (N, 3) each, it may lengthen freely to that length, within
+        limits; where it is shorter in one of `crooks`, it may shorten freely to that length.
 
-        `waist` vertices are held at the place of the skin that they have in the rest pose: the body at rest is
+        `waist` vertices are held at the place on the skin that is closest to them in the rest pose: the body at rest is
         `body_rest` (V, 3).
         """
         n, n_edges = self.topology.n_vertices, len(self.topology.mesh.edges)
         self._told_apart: F32 = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
         self._skin, self._middles = _Skin(n), _Skin(n_edges)
-        self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: nothing that was found holds
+        self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: the first call searches
         self.positions[:] = positions
         self.velocities[:] = 0
         length = self._lengths(rest)
@@ -159,7 +159,7 @@ class SimulatedCloth:
         self._anchors = found.face.numpy(), found.barycentrics.numpy(), offset[:, None].astype(np.float32)
 
     def _lengths(self, shape: F32) -> F32:
-        """Of what the distance constraints are between, in a shape (N, 3)."""
+        """Lengths of the distance constraints in a shape (N, 3)."""
         ends = shape[self._ends]
         length: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
         return length
@@ -177,10 +177,10 @@ class SimulatedCloth:
 
         Args:
             body_from: body vertices at the start [m], shape (V, 3).
-            body_to: at the end; the same object where the body rests.
+            body_to: the same at the end; the very same object where the body rests.
             gravity: acceleration [m/s²], shape (3,).
             drag: rate at which the velocity fades [1/s].
-            careful: contacts of edge midpoints, too, and a look for contacts twice as often.
+            careful: solve contacts of edge midpoints, too, and search for contacts as often as on a moving body.
 
         Returns:
             Root mean square speed of the vertices at the end [m/s].
@@ -212,7 +212,7 @@ class SimulatedCloth:
         return float(np.sqrt((self.velocities**2).sum(1).mean()))
 
     def _pairs(self) -> tuple[I32, I32, F32]:
-        """Vertices near a face of the same cloth that isn't near it in the rest shape, the face, and the side of it."""
+        """Vertices near a face that they aren't near in the rest shape, the face, and the vertex's side of it."""
         faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
         if float(np.sqrt(_squared_way(self.positions, self._searched_at).max())) > _PAIR_SLACK / 2:
             self._candidates = find_candidates(
@@ -239,7 +239,7 @@ class SimulatedCloth:
         return edges[which[kept]], point[kept], direction[kept], moved[kept]
 
     def _touch(self, skin: _Skin, points: F32, stale: I32, body: F32, motion: F32 | None) -> _Contacts:
-        """Contacts of `points` (N, 3) with the body (V, 3), which is asked about the `stale` ones."""
+        """Contacts of `points` (N, 3) with the body (V, 3), whose distance field is queried for the `stale` ones."""
         if len(stale):
             asked = points[stale]
             self._sdf.update(torch.from_numpy(body))
@@ -255,7 +255,7 @@ class SimulatedCloth:
         )  # fmt: skip
 
     def stretch(self, positions: F32 | None = None) -> float:
-        """99.9th percentile of the edges' length over their rest length; of vertices elsewhere (N, 3) [m], if given."""
+        """99.9th percentile of edge length over the length reached freely; of `positions` (N, 3) [m], if given."""
         edges = slice(-len(self.topology.edges), None)
         length = self._lengths(self.positions if positions is None else positions)[edges]
         return float(np.percentile(length / self._longest[edges], 99.9))

@@ -24,7 +24,7 @@ class GarmentSample:
     """One simulated garment and what it was simulated for."""
 
     vertices: NDArray[np.float32]
-    """Garment on the body at zero translation, SMPL axes [m], shape (N, 3); several one after the other (`parts`)."""
+    """Garment on the body at zero translation, SMPL axes [m], shape (N, 3); several follow one another (`parts`)."""
     pose: NDArray[np.float32]
     """θ that was simulated, rotation vectors [rad], shape (24, 3)."""
     betas: NDArray[np.float32]
@@ -42,9 +42,9 @@ class GarmentSample:
     frame: int | None
     """Number of that motion's frame; None for a drawn pose."""
     posture: str | None
-    """Which of `POSTURES` was varied; None for another pose."""
+    """Which of `POSTURES` was varied; None for any other pose."""
     unseen: float
-    """Distance in (θ, β, γ) to the nearest training sample; NaN for those and until the set is summarised."""
+    """Distance in (θ, β, γ) to the nearest training sample; NaN for training samples, and until `summarise` runs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class GarmentSequence:
     pose: NDArray[np.float32]
     """θ that was simulated, rotation vectors [rad], shape (T, 24, 3)."""
     transl: NDArray[np.float32]
-    """Translation of the body [m], shape (T, 3); not contained in the vertices."""
+    """Translation of the body [m], shape (T, 3); the vertices don't include it."""
     betas: NDArray[np.float32]
     """β, shape (10,)."""
     style: NDArray[np.float32]
@@ -76,7 +76,7 @@ class GarmentSequence:
     start: float
     """Where in the motion it starts [s]."""
     mirrored: bool
-    """Left and right of the motion are exchanged."""
+    """Whether left and right of the motion are exchanged."""
     _units: NDArray[np.int16]
 
     def __len__(self) -> int:
@@ -94,7 +94,7 @@ class GarmentSequence:
 class _Finished:
     """The finished rows of a set, in the order of their slots, memory-mapped and read-only.
 
-    A set that is still being written may be read: those rows are there that were finished when it was opened.
+    A set that is still being written can be read: it has the rows that were finished when it was opened.
     """
 
     def __init__(self, path: str | Path, kind: str, *, first_clip: int) -> None:
@@ -104,7 +104,7 @@ class _Finished:
         stored = Rows(self._path, kind)
         self._columns, self._rows = stored.arrays, stored.finished(DONE)
         self.parts = self._parts(self._columns["vertices"].shape[-2])
-        """Which of a row's vertices are each garment's: several where garments were simulated together."""
+        """The slice of a row's vertices of each garment: several where garments were simulated together."""
         self._clips = self._clip_names()
         self._check("split", 0, 2)
         self.test: NDArray[np.bool_] = self.column("split") == TEST
@@ -149,9 +149,9 @@ class _Finished:
             raise SimulationError(msg)
 
     def _check_numbers(self, name: str, largest: float) -> None:
-        """Raises `SimulationError` where a column has numbers that no `SmplFrame` takes."""
+        """Raises `SimulationError` where a column has numbers that no `SmplFrame` accepts."""
         values = self.column(name).reshape(len(self), -1)
-        bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))  # NaN isn't
+        bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))  # False for NaN
         if bad.size:
             msg = f"{self._path}: damaged: {name} of sample {bad[0]} isn't finite and at most {largest:g}; "
             msg += "simulate it again"
@@ -164,7 +164,7 @@ class _Finished:
     def column(self, name: str) -> NDArray[Any]:
         """A column of all rows as it is stored, shape (M, ...): `pose`, `betas` and so on.
 
-        `vertices` comes as `dequantise` takes it, and is as large as the set.
+        `vertices` are in the units that `dequantise` takes, and as large as the set.
 
         Raises `SimulationError` for a name that is no column.
         """
@@ -186,7 +186,7 @@ class _Finished:
 class GarmentDataset(_Finished):
     """The finished samples of a set, in the order of their slots, memory-mapped and read-only.
 
-    A set that is still being made may be read: those samples are there that were finished when it was opened.
+    A set that is still being made can be read: it has the samples that were finished when it was opened.
     """
 
     def __init__(self, path: str | Path) -> None:

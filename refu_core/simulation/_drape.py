@@ -1,8 +1,8 @@
-"""From (β, θ, γ) to a draped garment: the settled canonical drape, the way to the pose, the settling.
+"""From (β, θ, γ) to a draped garment: the settled canonical drape, the move to the pose, the settling.
 
-Simulated cloth depends on how it got where it is: reached by two ways, one pose leaves a T-shirt 10 to 16 mm apart and
-a skirt 13 to 51 mm. So every sample starts from the settled drape of its own shape and style in one canonical pose and
-takes the same way to its own pose: the result is a function of (β, θ, γ) alone, and samples don't depend on each other.
+Simulated cloth depends on how it got where it is: two paths to the same pose leave a T-shirt 10 to 16 mm apart and a
+skirt 13 to 51 mm. So every sample starts from the settled drape of its own shape and style in one canonical pose and
+takes a fixed path to its own pose: the result is a function of (β, θ, γ) alone, and samples don't depend on each other.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ class DrapeSettings:
     canonical_frames: int = 60
     """Most frames in which the canonical drape settles."""
     speed: float = 0.035
-    """Way of the fastest part of the body in a frame of the move, on average [m]."""
+    """Average distance that the fastest part of the body goes in a frame of the move [m]."""
     move_frames: tuple[int, int] = (12, 40)
     """Fewest and most frames of the move."""
     settle_frames: tuple[int, int] = (14, 45)
     """Fewest and most frames of settling; it ends early when the cloth rests."""
     careful_frames: int = 5
-    """Last frames, in which contacts of edge midpoints are solved, too."""
+    """Number of last frames, in which contacts of edge midpoints are solved, too."""
     rest_speed: float = 0.012
-    """Root mean square speed of a cloth at rest [m/s]."""
+    """Root mean square speed below which cloth counts as at rest [m/s]."""
     drag: tuple[float, float, float] = (130.0, 6.0, 30.0)
     """Rates at which velocity fades [1/s]: as the template becomes cloth, as the body moves, as the cloth settles."""
     waistband: float = 0.012
-    """Width of the band that holds to the skin [m]."""
+    """Width of the band that is held at the skin [m]."""
     gap: float = DEFAULT_GAP
-    """Room between two parts of the body [m]."""
+    """Gap that is kept between two parts of the body [m]."""
 
 
 def canonical_pose() -> NDArray[np.float32]:
@@ -97,7 +97,7 @@ def comfort_poses() -> NDArray[np.float32]:
 
 
 def crook_pose() -> NDArray[np.float32]:
-    """Elbows bent by 2 rad [rad], shape (24, 3): where a sleeve gets shorter, cloth wrinkles finer than its mesh."""
+    """Elbows bent by 2 rad [rad], shape (24, 3): where a sleeve gets shorter, its wrinkles are finer than its mesh."""
     pose = np.zeros((N_JOINTS, 3), np.float32)
     pose[18, 1], pose[19, 1] = -2.0, 2.0
     return pose
@@ -112,7 +112,7 @@ def _alone(values: NDArray[np.floating]) -> torch.Tensor:
 def colliders(body: SmplBody, collider: Collider, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
     """The colliders of a body in poses (P, 24, 3) [rad] and a shape (10,), root rotation included [m], (P, V, 3).
 
-    Overlaps are pulled apart as the root sees them, as `refu_core.realtime.dress` does it: the root only turns.
+    As in `refu_core.realtime.dress`, overlaps are pulled apart in the root's frame, before the root's rotation.
     """
     shape = _alone(betas)
     turns, at_root = RootTurn.taken_off(torch.as_tensor(poses, dtype=torch.float32), body.rest_joints(shape))
@@ -130,7 +130,7 @@ class SettledDrape:
     speed: float
     """Root mean square speed that is left [m/s]."""
     stretch: float
-    """99.9th percentile of the edges' length over their rest length."""
+    """99.9th percentile of edge length over the length that the edge reaches freely."""
 
 
 class Draper:
@@ -141,15 +141,15 @@ class Draper:
     ) -> None:
         """Prepares for `garment`, or several that are worn together, on `body`, all on the CPU.
 
-        Raises `MeshError` when the body isn't watertight or a garment's mesh isn't one of edges of one or two faces.
+        Raises `MeshError` when the body isn't watertight or an edge of a garment doesn't have one or two faces.
         """
         self.outfit = garment if isinstance(garment, JoinedGarments) else JoinedGarments([garment])
         self.garment = garment = self.outfit.joined
         self.body = body
         self.settings = settings or DrapeSettings()
         self.topology = ClothTopology.of(garment.mesh)
-        # Which of two equally close faces is found depends on the BVH, and with it a result's last bit: it is built
-        # anew for each drape, on a mesh that only depends on the drape, and never in between.
+        # The BVH decides which of two equally close faces is found, and so a result's last bit. It is built anew for
+        # each drape, on a mesh that depends on the drape alone, and never in between.
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
         self._collider = Collider(body, gap=self.settings.gap)
@@ -190,7 +190,8 @@ class Draper:
         return self._canonical[1:]
 
     def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32]:
-        # Dressed in the T-pose that it was cut in: lowered by skinning, an armpit would start out folded into itself.
+        # The garment is put on in the T-pose that it was cut in: if skinning lowered its arms, the armpits would start
+        # out folded into themselves.
         s = self.settings
         rest = self.rest(betas, style)
         body = self.bodies(np.zeros((1, N_JOINTS, 3)), betas)[0]

@@ -1,4 +1,4 @@
-"""Garments simulated together: one cloth whose parts hang together nowhere, from the skin outwards."""
+"""Garments simulated together: one cloth of unconnected parts, from the skin outwards."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32
 
 _OVER = 0.006
-"""How far over the garments below it a garment starts [m]: twice the cloth's thickness."""
+"""How far above the garments below it a garment starts [m]: twice the cloth's thickness."""
 _BESIDE = 0.025
-"""How far around a vertex what is below it counts [m]: two of a garment's edges."""
+"""Vertices of inner garments within this of a vertex count as below it [m]: two of a garment's edges."""
 
 
 def slices_of(counts: Mapping[str, int]) -> dict[str, slice]:
-    """Which of the vertices of garments that follow each other are each garment's, by their numbers of vertices."""
+    """The slice of vertices of each garment where garments follow one another, from their numbers of vertices."""
     ends = accumulate(counts.values())
     return {name: slice(end - count, end) for (name, count), end in zip(counts.items(), ends, strict=True)}
 
 
 class JoinedGarments:
-    """Garments worn together, as the one that a cloth is made of: it lies on the skin and on itself, like any cloth.
+    """Garments worn together, joined into one that is simulated as one cloth: it lies on the skin and on itself.
 
-    One garment alone is itself.
+    A single garment is left as it is.
     """
 
     def __init__(self, garments: Sequence[GarmentTemplate]) -> None:
-        """Of garments for one body, in any order.
+        """Joins garments for one body, given in any order.
 
-        Raises `SimulationError` for none, for one twice, and for garments of different bodies.
+        Raises `SimulationError` for no garment, for the same one twice, and for garments of different bodies.
         """
         by_name = {garment.name: garment for garment in garments}
         if not garments or len(by_name) < len(garments) or len({garment.body for garment in garments}) > 1:
@@ -50,17 +50,17 @@ class JoinedGarments:
         self.parts = slices_of({garment.name: garment.n_vertices for garment in self.garments})
         """Which of the joined garment's vertices are each garment's."""
         self.joined = _joined(self.garments, self.parts)
-        """All of it as one template; its name has all names in it, its card is that of the outermost."""
+        """All garments as one template; its name contains all their names, its card is the outermost garment's."""
 
     @property
     def number_of_vertex(self) -> NDArray[np.intp]:
-        """Which garment a vertex is of, from the skin outwards, shape (N,)."""
+        """Number of the garment that each vertex belongs to, from the skin outwards, shape (N,)."""
         return np.repeat(np.arange(len(self.garments)), [garment.n_vertices for garment in self.garments])
 
     def layered(self, positions: F32, body: F32, sdf: ExactSdf) -> F32:
-        """`positions` (N, 3) [m] with each garment lifted off the skin until it is over all that is below it.
+        """`positions` (N, 3) [m] with each garment lifted off the skin until it is above the garments below it.
 
-        `sdf` is that of the body's vertices `body` (V, 3). Where one garment is far from another nothing moves.
+        `sdf` is that of the body's vertices `body` (V, 3). Where garments are far apart nothing moves.
         """
         out: F32 = positions.copy()
         for garment in self.garments[1:]:

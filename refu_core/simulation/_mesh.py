@@ -16,14 +16,14 @@ from refu_core.mesh import Connectivity, linked
 
 @dataclass(frozen=True, eq=False)
 class ClothTopology:
-    """What constraints on a garment of N vertices are between."""
+    """The pairs of vertices that the constraints on a garment of N vertices connect."""
 
     mesh: Connectivity
     edges: NDArray[np.int32]
-    """Those of the mesh by colour, shape (E, 2): no two neighbours in the list share a vertex, which keeps a
-    processor's pipeline full."""
+    """Edges of the mesh sorted by colour, shape (E, 2): edges of one colour share no vertex, which keeps a processor's
+    pipeline full."""
     bends: NDArray[np.int32]
-    """The two vertices opposite each inner edge, by colour, too, shape (B, 2)."""
+    """The two vertices opposite each inner edge, also sorted by colour, shape (B, 2)."""
 
     @staticmethod
     def of(mesh: Connectivity) -> ClothTopology:
@@ -54,7 +54,7 @@ class ClothTopology:
         return [np.flatnonzero((label == k) & on_rim) for k in dict.fromkeys(label[on_rim])]
 
     def distance_from(self, vertices: NDArray[Any], sources: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Shortest way along the edges of the mesh `vertices` (N, 3) from any of `sources` to each [m], shape (N,)."""
+        """Shortest path along the edges from any of `sources` to each of `vertices` (N, 3) [m], shape (N,)."""
         i, j = self.mesh.edges.T
         length = np.linalg.norm(vertices[i] - vertices[j], axis=1) + 1e-9
         graph = coo_array((length, (i, j)), shape=(self.n_vertices,) * 2).tocsr()
@@ -62,7 +62,7 @@ class ClothTopology:
 
 
 def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The pairs in an order in which those of one colour (no shared vertex) follow each other; greedy."""
+    """The pairs sorted by a greedy colouring: pairs of one colour share no vertex."""
     taken: dict[int, int] = {}  # bit mask of the colours around a vertex
     colour = np.empty(len(pairs), np.int64)
     for k, (i, j) in enumerate(pairs.tolist()):

@@ -16,14 +16,14 @@ from refu_core.simulation._poses import Clip, mirrored, without_heading
 FPS = 30
 """Frames of a sequence [1/s]."""
 STEPS = 2
-"""Simulated frames a frame of the sequence."""
+"""Simulated frames per frame of the sequence."""
 _SMOOTH = 2.0  # simulated frames: standard deviation of the low-pass on recorded translations, which jitter
-_MOST_ACCELERATION = 20.0  # [m/s²]: what a jump has; more is a fault of the recording
+_MOST_ACCELERATION = 20.0  # [m/s²]: as in a jump; more is an error of the recording
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnMotion:
-    """A stretch of a clip, at `STEPS` simulated frames a frame: n of them."""
+    """A stretch of a clip as n simulated frames, `STEPS` per frame of the sequence."""
 
     poses: NDArray[np.float32]
     """Rotation vectors [rad], shape (n, 24, 3); the first one faces +z."""
@@ -34,10 +34,10 @@ class DrawnMotion:
     start: float
     """Where in the clip it starts [s]."""
     mirrored: bool
-    """Left and right are exchanged."""
+    """Whether left and right are exchanged."""
 
     def acceleration(self) -> NDArray[np.float64]:
-        """Of the root [m/s²], shape (n, 3)."""
+        """Acceleration of the root, smoothed and limited [m/s²], shape (n, 3)."""
         if len(self.transl) < 3:
             return np.zeros_like(self.transl)
         smooth = gaussian_filter1d(self.transl, _SMOOTH, axis=0, mode="nearest")
@@ -48,7 +48,7 @@ class DrawnMotion:
 
 
 def n_steps(n_frames: int) -> int:
-    """Simulated frames of a sequence of `n_frames`: its frames and what lies between them."""
+    """Simulated frames of a sequence of `n_frames`: its frames and those between them."""
     return (n_frames - 1) * STEPS + 1
 
 

@@ -1,4 +1,4 @@
-"""Pieces of a cloth that come near each other, in Numba: what is far apart in the rest shape and near now."""
+"""Finds pieces of a cloth that are near each other now but far apart in the rest shape, in Numba."""
 
 import numba
 import numpy as np
@@ -10,9 +10,9 @@ _Ints = NDArray[np.int32]
 
 @numba.njit(cache=True, fastmath=True)
 def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, cell: float) -> tuple[_Ints, _Ints]:
-    """Vertices whose distance to the centre of a face is at most `cell`, and in the rest shape at least `rest_apart`.
+    """Pairs of a vertex and a face whose centre is at most `cell` away, and at least `rest_apart` in the rest shape.
 
-    Faces are binned by their centres in a grid of cells of that size. Returns the vertex and the face, (C,), by vertex.
+    Faces are binned by their centres in a grid of cells of that size. Returns vertices and faces, (C,) each, by vertex.
     """
     n = x.shape[0]
     m = faces.shape[0]
@@ -42,7 +42,7 @@ def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, 
         start[c + 1] += start[c]
     fill = start[:-1].copy()
     member = np.empty(m, np.int32)
-    here = np.empty((6, m), np.float32)  # the centres in the order of the cells, a coordinate at a time: SIMD
+    here = np.empty((6, m), np.float32)  # the centres by cell, one row per coordinate, for SIMD
     for f in range(m):
         s = fill[key[f]]
         fill[key[f]] += 1
@@ -63,7 +63,7 @@ def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, 
         for di in range(ci - 1, ci + 2):
             for dj in range(cj - 1, cj + 2):
                 row = (di * size[1] + dj) * size[2] + ck
-                first, last = np.uint64(start[row - 1]), np.uint64(start[row + 2])  # three cells that follow each other
+                first, last = np.uint64(start[row - 1]), np.uint64(start[row + 2])  # three consecutive cells
                 hits = 0  # counted first, without a branch: nearly all rows have none
                 for s in range(first, last):
                     px, py, pz = x[i, 0] - cx[s], x[i, 1] - cy[s], x[i, 2] - cz[s]
@@ -88,9 +88,9 @@ def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, 
 
 @numba.njit(cache=True, fastmath=True)
 def near_pairs(x: _Floats, faces: _Ints, vertex: _Ints, face: _Ints, reach: float) -> tuple[_Ints, _Ints, _Floats]:
-    """Of candidates (C,) those whose vertex is within `reach` of the plane of its face.
+    """The candidates (C,) whose vertex is within `reach` of the plane of its face.
 
-    Returns the vertex (S,), the face's vertices (S, 3) and the side of it (S,), by vertex.
+    Returns the vertex (S,), the face's vertices (S, 3) and the side of the face that the vertex is on (S,), by vertex.
     """
     n = vertex.shape[0]
     which = np.empty(n, np.int32)

@@ -1,7 +1,7 @@
 """What is simulated: which shape, style and pose each slot of a data set has.
 
-Every draw comes from a generator seeded by the plan's seed and the number of what is drawn, so a slot means the same on
-every machine, in every order, and after every interruption.
+Every draw comes from a generator seeded with the plan's seed and the number of the item drawn, so a slot is the same on
+every machine, in any order and after any interruption.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _MOST = 10**9
 
 
 def garments_of(garment: str | Sequence[str]) -> list[str]:
-    """The garments of a plan, as they were asked for."""
+    """The garments of a plan, as they were given."""
     return [garment] if isinstance(garment, str) else list(garment)
 
 
 def names_of(garment: str | Sequence[str]) -> str:
-    """Their names, however their files are called, in one text whatever their order; a set's card has such a text."""
+    """The garments' names, sorted and joined by `+`, whatever their files are called; takes a card's joined name."""
     return "+".join(sorted(name for one in garments_of(garment) for name in garment_name(one).split("+")))
 
 
 def truncated_normal(u: NDArray[np.float64], spread: float) -> NDArray[np.float32]:
-    """Normal numbers of this standard deviation, cut off at ±2, of evenly distributed `u` in [0, 1)."""
+    """Maps uniform `u` in [0, 1) to normal numbers of this standard deviation, cut off at ±2."""
     edge = ndtr(2 / spread)
     value: NDArray[np.float32] = np.clip(spread * ndtri((1 - edge) + u * (2 * edge - 1)), -2, 2).astype(np.float32)
     return value
@@ -47,13 +47,13 @@ def truncated_normal(u: NDArray[np.float64], spread: float) -> NDArray[np.float3
 class SamplePlan:
     """The slots of one data set.
 
-    Half of the training samples belong to `pivots` style-shape pairs with many poses each (TailorNet's high-frequency
-    networks are one a pivot), the other half to pairs with `poses_per_pair` poses (its low-frequency and style-shape
-    networks learn from them). Test samples have pairs of their own and poses of clips kept for the test.
+    Half of the training samples belong to `pivots` style-shape pairs with many poses each (TailorNet has one
+    high-frequency network per pivot), the other half to pairs with `poses_per_pair` poses (its low-frequency and
+    style-shape networks learn from these). Test samples have their own pairs, and poses from clips kept for the test.
     """
 
     garment: str | Sequence[str]
-    """One, or several that are simulated together."""
+    """One garment, or several that are simulated together."""
     count: int
     """Samples in the set, training and test together."""
     seed: int = 0
@@ -63,15 +63,15 @@ class SamplePlan:
     recorded_share: float = 0.6
     """Share of poses that are frames of motions."""
     posture_share: float = 0.0
-    """Share of poses that are everyday postures, varied (`POSTURES`); the rest are drawn within the limits of human
+    """Share of poses that are varied everyday postures (`POSTURES`); the rest are drawn within the limits of human
     joints."""
     spread: float = 1.2
     """Standard deviation of β and γ before they are cut off at ±2."""
     block: int = 12
-    """Slots that are simulated together, one after the other, from one canonical drape."""
+    """Most slots that are simulated one after the other from one canonical drape."""
 
     def __post_init__(self) -> None:
-        """Raises `SimulationError` for what makes no plan: they are read from cards, too."""
+        """Raises `SimulationError` for values that make no plan; plans are also read from cards."""
         whole = self.count, self.seed, self.pivots, self.poses_per_pair, self.block
         shares = self.test_share, self.recorded_share, self.posture_share, self.spread
         is_named = isinstance(self.garment, (str, list, tuple)) and all(isinstance(name, str) for name in self.garment)
@@ -116,7 +116,7 @@ class SamplePlan:
     def blocks(self) -> list[range]:
         """The slots in runs of one style-shape pair and at most `block` slots, in an order that mixes all kinds.
 
-        So a set is representative from its first hour on.
+        This makes a set representative from its first hour on.
         """
         runs: list[range] = []
         start = 0
@@ -144,7 +144,7 @@ class SamplePlan:
     def pose(self, slot: int, attempt: int, clips: Sequence[Clip]) -> tuple[NDArray[np.float32], int, int]:
         """The pose that a slot tries at its `attempt`: (24, 3) [rad], the clip's number and frame.
 
-        The clip is -1 where it is none, and the frame the posture's number, or -1 where it is none either.
+        Without a clip its number is -1 and the frame is the posture's number, or -1 for a random pose.
         """
         rng = np.random.default_rng(self._key(3, slot, attempt))
         kind = rng.random()

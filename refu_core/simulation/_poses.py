@@ -48,10 +48,10 @@ class Clip:
     fps: float
     """Frames a second."""
     notes: tuple[str, ...] = ()
-    """What the reader took for granted or turned: to be shown to whoever gave the file."""
+    """What the reader assumed or converted, to be shown to the person who gave the file."""
 
     def resampled(self, fps: float) -> Clip:
-        """The motion at another frame rate, rotations on the shorter arc; `SimulationError` for a million frames."""
+        """The motion at another frame rate, rotations on the shorter arc; `SimulationError` above a million frames."""
         n = len(self.poses)
         try:
             wanted = np.minimum(np.arange(n_resampled(n, self.fps, fps)) * (self.fps / fps), n - 1)
@@ -63,12 +63,12 @@ class Clip:
 
 
 def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = None) -> list[Clip]:
-    """The motions of a file or a folder, by name, with y up; `docs/guide/inputs.md` lists what files are recognised.
+    """The motions of a file or a folder, by name, with y up; `docs/guide/inputs.md` lists the recognised files.
 
     Args:
-        path: a file, or a folder of them and of such folders, as AMASS comes.
-        axes: what the files' roots are expressed in; `auto` sees it from the people, and says so in `Clip.notes`.
-        fps: frames a second, in place of what the files say.
+        path: a file, or a folder of files and subfolders, as in AMASS.
+        axes: axes of the files' roots; `auto` infers them from how people stand, and says so in `Clip.notes`.
+        fps: frames a second, instead of what the files say.
 
     Raises:
         SimulationError: nothing there, or a file of another layout.
@@ -92,17 +92,17 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
 
 
 def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
-    """Clips that were loaded already, or those of a file or folder. Raises as `load_clips`."""
+    """The given clips, or those loaded from a file or folder. Raises as `load_clips`."""
     return load_clips(motions) if isinstance(motions, (str, Path)) else list(motions)
 
 
 def _is_shape(path: Path) -> bool:
-    """AMASS has shapes without motion in the folders of its motions."""
+    """Whether a file holds a shape without motion; AMASS keeps such files among its motions."""
     return path.name == "shape.npz" or path.stem.endswith("_stagei")
 
 
 def split_clips(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
-    """Train and test clips: every fifth by name, from the second on, is kept for the test, whole.
+    """Train and test clips: in order of name, every fifth from the second on is kept whole for the test.
 
     Raises `SimulationError` for fewer than two clips, which can't be split.
     """
@@ -118,7 +118,7 @@ def without_heading(pose: NDArray[np.floating]) -> NDArray[np.float32]:
     """The pose (24, 3) turned about the vertical so that the root faces +z; its tilt stays [rad]."""
     root = Rotation.from_rotvec(np.asarray(pose[0], np.float64))
     forward = root.apply([0.0, 0.0, 1.0])
-    if np.hypot(forward[0], forward[2]) < 0.1:  # lying: the heading is that of the head
+    if np.hypot(forward[0], forward[2]) < 0.1:  # lying: the head gives the heading, the feet if the face is up
         forward = root.apply([0.0, 1.0, 0.0]) * -np.sign(forward[1])
     out = np.array(pose, np.float32)
     out[0] = (Rotation.from_euler("y", -np.arctan2(forward[0], forward[2])) * root).as_rotvec()
@@ -146,7 +146,7 @@ def random_pose(rng: np.random.Generator) -> NDArray[np.float32]:
 def clip_pose(clips: Sequence[Clip], rng: np.random.Generator) -> tuple[NDArray[np.float32], int, int]:
     """A frame of a clip, mirrored or not, without its heading; the clip's number; the frame's number."""
     lengths = np.array([len(clip.poses) for clip in clips], np.float64)
-    which = int(rng.choice(len(clips), p=np.sqrt(lengths) / np.sqrt(lengths).sum()))  # short clips have their say
+    which = int(rng.choice(len(clips), p=np.sqrt(lengths) / np.sqrt(lengths).sum()))  # short clips count, too
     frame = int(rng.integers(len(clips[which].poses)))
     pose = clips[which].poses[frame]
     if rng.random() < 0.5:

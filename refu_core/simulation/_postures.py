@@ -15,7 +15,7 @@ Angles = Mapping[str, tuple[float, float, float]]
 
 
 def _both(**left: tuple[float, float, float]) -> dict[str, tuple[float, float, float]]:
-    """Joints of the left side, and of the right one as its mirror image."""
+    """The given joints of the left side, and those of the right side as their mirror image."""
     return {
         f"{side}_{name}": (x, s * y, s * z)
         for side, s in (("left", 1), ("right", -1))
@@ -88,11 +88,11 @@ POSTURES: Mapping[str, Angles] = {
 }
 """By name: rotation vectors of joints [degrees], zero for those that aren't named; SMPL's axes, x to the left."""
 SELF_TOUCHING = tuple(POSTURES)[:8]
-"""Those in which the skin runs through itself."""
+"""The postures in which the skin intersects itself."""
 _SPREAD = 8.0
 """Standard deviation of a drawn posture's joints about the named one, in each coordinate [degrees]."""
 _STIFF = tuple(JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right") for name in ("foot", "wrist", "hand"))
-"""Joints that no garment feels."""
+"""Joints that affect no garment; they aren't varied."""
 
 
 def posture(name: str) -> NDArray[np.float32]:
@@ -104,7 +104,7 @@ def posture(name: str) -> NDArray[np.float32]:
 
 
 def drawn_posture(rng: np.random.Generator) -> tuple[NDArray[np.float32], int]:
-    """One of `POSTURES` as somebody else would hold it, mirrored or not, without heading; and its number.
+    """One of `POSTURES`, varied at random, mirrored or not, without heading; and its number.
 
     Rotation vectors [rad], shape (24, 3).
     """

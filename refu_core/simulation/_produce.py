@@ -1,4 +1,4 @@
-"""Making a set, whatever is in it: a directory that is its own, an engine that shares it, resuming, progress."""
+"""Makes a set of any kind: in a directory of its own, with an engine that shares the work, resuming, and progress."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from refu_core.simulation._worker import SimulationSettings, Simulator, SlotSimu
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a set is."""
+    """How far the work on a set has got."""
 
     done: int
     """Slots (samples, or whole sequences) that are finished."""
@@ -37,7 +37,7 @@ class Progress:
 
 
 def _block_maker(make: Callable[[], Simulator]) -> Callable[[list[int]], list[dict[str, Any]]]:
-    """A process's function from slots to their rows; what it is made of is small enough to be sent there."""
+    """Makes a process's function from slots to their rows; `make` is small enough to be sent to that process."""
     return make().block
 
 
@@ -49,12 +49,12 @@ def produce(
     progress: Callable[[Progress], None] | None,
     **card: Any,
 ) -> None:
-    """Simulates what is left of the set in `output`, whose card says `card` besides. Raises as `simulate_dataset`.
+    """Simulates what is left of the set in `output`; `card` is added to the set's card. Raises as `simulate_dataset`.
 
-    `make` makes a process's simulator; it is sent to each process, so it is small. Rows are written here alone, whoever
-    has simulated them: other machines need not see the folder.
+    `make` makes a process's simulator; it is sent to each process, so it is small. Only this process writes rows,
+    whichever process has simulated them: other machines needn't see the folder.
     """
-    # Made here although workers make their own: a body or garment that won't do is refused before anything is written.
+    # Also made here, though workers make their own: an unsuitable body or garment is refused before any writing.
     simulator = make()
     blocks = [list(block) for block in simulator.plan.blocks()]
     slots = np.array([slot for block in blocks for slot in block], np.int32)
@@ -69,11 +69,11 @@ def produce(
         state, row_of = rows.arrays["state"], {int(slot): row for row, slot in enumerate(slots)}
         left = [[slot for slot in block if state[row_of[slot]] == TO_DO] for block in blocks]
         make_block: Callable[[], Callable[[list[int]], list[dict[str, Any]]]] = partial(_block_maker, make)
-        if engine is None or isinstance(engine, InProcess):  # a slot at a time is on disk soonest
+        if engine is None or isinstance(engine, InProcess):  # one slot at a time is on disk soonest
             engine, make_block = InProcess(), lambda: simulator.block
             left = [[slot] for block in left for slot in block]
         left = [block for block in left if block]
-        # A whole block goes to one process, for the sake of its common canonical drape.
+        # A whole block goes to one process, because its slots share a canonical drape.
         done, total, lost = 0, sum(map(len, left)), 0
         for index, made in engine.run(make_block, left):
             if isinstance(made, Lost):
@@ -92,7 +92,7 @@ def produce(
 
 
 def _card_of(simulator: Simulator) -> dict[str, Any]:
-    """What a simulator's set is, before there is anything in it."""
+    """The card of a simulator's set before there is anything in it."""
     garment, body, clips = simulator.garment, simulator.body, simulator.clips
     digest = hashlib.sha256()
     for tensor in (garment.faces, garment.weights, garment.v_template, garment.shapedirs, garment.styledirs):
@@ -110,7 +110,7 @@ def _card_of(simulator: Simulator) -> dict[str, Any]:
         "garment_fingerprint": digest.hexdigest()[:16],
         "motions_fingerprint": motions.hexdigest()[:16],
         "quantum_m": QUANTUM,
-        "plan": asdict(simulator.plan) | {"garment": garment.name},  # however its file was named
+        "plan": asdict(simulator.plan) | {"garment": garment.name},  # whatever its file was called
         "settings": asdict(simulator.settings),
         "clips": {"train": [clip.name for clip in clips[0]], "test": [clip.name for clip in clips[1]]},
         "versions": {
@@ -171,13 +171,13 @@ def simulate_dataset(
         output: directory of the set; it is made, or must hold the beginning of the same set.
         motions: a folder of motion files, or what `load_clips` has read, two at least; None for drawn poses alone.
         body: name or file of a body; None for the one the garment was cut for.
-        seed: of everything that is drawn.
-        engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None for this one alone.
+        seed: seed of everything that is drawn.
+        engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None to use this one alone.
         test_share: share of the samples that is kept for the test.
         recorded_share: share of the poses that are frames of the motions.
-        posture_share: share of the poses that are everyday postures, varied; the others are drawn.
+        posture_share: share of the poses that are varied everyday postures; the others are drawn.
         pivots: style-shape pairs that half of the training samples share.
-        settings: of simulation and selection.
+        settings: settings of simulation and selection.
         progress: called in this process after each slot.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What may enter a data set: exact checks of a drape against the body and against itself, limits of its stretch."""
+"""What may enter a data set: exact checks of a drape against the body and against itself, limits on its stretch."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ CAUSES = ("body_collision", "self_intersection", "stretch", "unsettled")
 
 @dataclass(frozen=True)
 class SelectionSettings:
-    """Limits of what is taken."""
+    """Limits on the drapes that are taken."""
 
     stretch: float = 1.15
-    """Of the 99.9th percentile of an edge's length over its rest length."""
+    """Limit on the 99.9th percentile of edge length over the length that the edge reaches freely."""
     speed: float = 0.10
-    """Of the root mean square speed that is left [m/s]: a faster cloth hasn't settled."""
+    """Limit on the root mean square speed that is left [m/s]: a faster cloth hasn't settled."""
 
 
 class Selector:
-    """Says of a drape, as it will be stored, why it can't be taken."""
+    """Says why a drape can't be taken, judged as it will be stored."""
 
     def __init__(self, body_faces: Any, garment_faces: Any, *, settings: SelectionSettings | None = None) -> None:
         """For a garment on a body, faces of the shape (F, 3) each."""
@@ -35,10 +35,10 @@ class Selector:
         self._itself = SheetChecker(garment_faces)
 
     def cause(self, vertices: F32, body: F32, *, stretch: float = 1.0, speed: float = 0.0) -> str | None:
-        """One of `CAUSES`, or None for a drape with nothing against it.
+        """One of `CAUSES`, or None for a drape that can be taken.
 
-        `vertices` (N, 3) are the garment's as they will be read back, `body` (V, 3) those of what it lies on [m];
-        `stretch` and `speed` are what `SettledDrape` calls so.
+        `vertices` (N, 3) are the garment's as they will be read back, `body` (V, 3) those of the body below it [m];
+        `stretch` and `speed` are those of `SettledDrape`.
         """
         self._body.update(body)
         if not self._body.check(vertices, self._garment_faces).is_free:

@@ -32,21 +32,21 @@ from refu_core.simulation._worker import FARTHEST, SimulationSettings, Simulator
 
 @dataclass(frozen=True)
 class SequencePlan:
-    """Sequence k is on shape k % `shapes`, in the mean style, and has a stretch of motion of its own.
+    """Sequence k has the shape k % `shapes`, the mean style, and a stretch of motion of its own.
 
-    Shapes are drawn one by one: those of a set of 5 are the first of a set of 17.
+    Shapes are drawn one by one: the 5 shapes of one set are the first 5 of a set with 17.
     """
 
     garment: str | Sequence[str]
-    """One, or several that are simulated together."""
+    """One garment, or several that are simulated together."""
     count: int
     """Sequences in the set, training and test together."""
     shapes: int = 5
     seconds: float = 10.0
-    """Of each sequence."""
+    """Length of each sequence."""
     seed: int = 0
     test_share: float = 1 / 4
-    """Share of each shape's sequences, rounded up, whose motions are of clips kept for the test; not all of them."""
+    """Share of each shape's sequences, rounded up but never all, whose motions are from clips kept for the test."""
     spread: float = 1.2
     """Standard deviation of β before it is cut off at ±2."""
 
@@ -84,17 +84,17 @@ class SequencePlan:
         return truncated_normal(u, self.spread), np.zeros(N_STYLES, np.float32)
 
     def motion(self, slot: int, clips: list[Clip]) -> DrawnMotion:
-        """What a sequence shows. Raises `SimulationError` when no clip is long enough."""
+        """The motion that a sequence shows. Raises `SimulationError` when no clip is long enough."""
         rng = np.random.default_rng(self._key(2, slot))
         return draw_motion(clips, self.n_frames, rng)
 
 
 @dataclass(frozen=True)
 class SequenceSettings(SimulationSettings):
-    """All settings of a set of sequences but its plan."""
+    """All settings of a set of sequences except its plan."""
 
     drag: float = 6.0
-    """Rate at which the cloth's velocity fades in the air that goes with the body [1/s]."""
+    """Rate at which the cloth's velocity fades in the air, which moves with the body [1/s]."""
     rebuild_every: int = 10
     """Simulated frames after which the body's tree of triangles is built anew."""
 
@@ -109,14 +109,14 @@ class SequenceSimulator(Simulator):
     def __init__(
         self, plan: SequencePlan, clips: tuple[list[Clip], list[Clip]], settings: SequenceSettings, body: Any
     ) -> None:
-        """As `Simulator`; raises `SimulationError`, too, when the clips of a split are too short."""
+        """As `Simulator`; also raises `SimulationError` when the clips of a split are too short."""
         super().__init__(plan, clips, settings, body)
         for slot in (0, plan.count - 1):
             plan.motion(slot, clips[plan.split_of(slot) == TEST])
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a row's garments."""
+        """Shape of a row's garments."""
         return (self.plan.n_frames, *super().shape)
 
     def simulate(self, slot: int) -> dict[str, Any]:
@@ -136,8 +136,9 @@ class SequenceSimulator(Simulator):
     def _play(self, motion: DrawnMotion, betas: F32, style: F32) -> dict[str, NDArray[Any]]:
         """Garments (T, N, 3), causes, stretch and speed (T,) of a motion, by the names of their columns.
 
-        The cloth lives in a frame of reference that goes with the root and doesn't turn: there, the body's acceleration
-        is a gravity of the other sign, and the air is still. It starts at rest in the first pose.
+        The cloth is simulated in a frame of reference that moves with the root and doesn't turn. There, the body's
+        acceleration acts as gravity with the opposite sign, and the air is still. The cloth starts at rest in the first
+        pose.
         """
         s, cloth, poses = self.settings, self._draper.cloth, motion.poses
         drape = self._draper.drape(poses[0], betas, style)
@@ -153,13 +154,13 @@ class SequenceSimulator(Simulator):
             if k:
                 if k % s.rebuild_every == 0:
                     self._draper.rebuild(bodies[k - 1])
-                careful = k % STEPS == 0  # where a frame is taken; elsewhere it would only take time
+                careful = k % STEPS == 0  # where a frame is stored; elsewhere it would only take time
                 now = cloth.frame(bodies[k - 1], body, gravity=gravity[k], drag=s.drag, careful=careful)
             if not np.abs(cloth.positions).max() <= FARTHEST:
                 break  # the cloth is lost, and with it the rest of the sequence
             if k % STEPS == 0:
                 t = k // STEPS
-                stretch[t], speed[t] = cloth.stretch(), now  # a moving cloth may be fast
+                stretch[t], speed[t] = cloth.stretch(), now  # a moving cloth may be fast: no limit on its speed
                 found, vertices[t] = self._examine(cloth.positions, body, stretch=float(stretch[t]))
                 cause[t] = 0 if found is None else 1 + CAUSES.index(found)
         return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
@@ -181,9 +182,9 @@ def simulate_sequences(
 ) -> dict[str, Any]:
     """Simulates a set of `count` sequences of a built-in garment, or goes on with one that was interrupted.
 
-    What holds for `simulate_dataset` holds here; the unit that is finished or not is a whole sequence. Best make
-    `count` a multiple of `shapes`, the body shapes in the set. `motions` must be there, of `seconds` or more each: that
-    is the length of a sequence.
+    It works as `simulate_dataset`, but what is finished or not is a whole sequence. It is best to make `count` a
+    multiple of `shapes`, the number of body shapes in the set. `motions` are required. A sequence is `seconds` long, so
+    only motions of at least that length are used.
 
     Raises as `simulate_dataset`, and `SimulationError` for motions that are too short.
     """

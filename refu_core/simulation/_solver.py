@@ -22,16 +22,16 @@ def substep(
     previous: _Floats,  # scratch (N, 3)
     inverse_mass: _Floats,  # (N,)
     ends: NDArray[np.uint32],  # vertices of the distance constraints (E, 2)
-    shortest: _Floats,  # between these two lengths they give way freely (E,)
+    shortest: _Floats,  # between these two lengths a constraint gives way freely (E,)
     longest: _Floats,
-    softness: _Floats,  # their compliance over h² (E,)
+    softness: _Floats,  # compliance over h² (E,)
     h: float,
     gravity: _Floats,  # (3,)
     damping: float,
     contact_vertex: _Ints,  # (C,)
     contact_point: _Floats,  # (C, 3), advanced by contact_motion once
     contact_normal: _Floats,  # (C, 3)
-    contact_motion: _Floats,  # of the skin in this substep (C, 3)
+    contact_motion: _Floats,  # motion of the skin in this substep (C, 3)
     margin: float,
     friction: float,
     anchor_vertex: _Ints,  # (A,)
@@ -154,7 +154,7 @@ def _separate_pairs(
 ) -> None:
     """Pushes a vertex and a face of the cloth apart to `thickness`, on the side where the vertex was found."""
     one = np.float32(1.0)
-    slack = np.float32(0.02)  # a vertex over the rim of a face belongs to its neighbour, too
+    slack = np.float32(0.02)  # a vertex just past the edge of a face counts for the faces on both sides
     for c in range(pair_vertex.shape[0]):
         i = pair_vertex[c]
         a = pair_face[c, 0]
@@ -219,10 +219,10 @@ def refresh_points(
     moving: bool,
     near: float,
 ) -> tuple[_Ints, _Floats, _Floats, _Floats]:
-    """Contacts of the points near the skin: their number, the point on the skin, its normal, its motion in a substep.
+    """Contacts of the points near the skin: index of the point, place on the skin, its normal, its motion in a substep.
 
-    `normal` (N, 3) keeps the direction from the skin to each point as it was when it was asked for; the `stale` ones
-    get theirs here.
+    `normal` (N, 3) keeps the direction from the skin to each point as of the point's last query; that of the `stale`
+    points is computed here.
     """
     n = x.shape[0]
     for s in range(stale.shape[0]):
@@ -241,7 +241,7 @@ def refresh_points(
             sign = np.float32(1.0) if asked_distance[i] >= 0 else np.float32(-1.0)
             for k in range(3):
                 normal[i, k] *= sign / length
-        else:  # on the skin a difference has no direction
+        else:  # on the skin the difference has no direction: the face's normal
             ux, uy, uz = body[b, 0] - body[a, 0], body[b, 1] - body[a, 1], body[b, 2] - body[a, 2]
             vx, vy, vz = body[c, 0] - body[a, 0], body[c, 1] - body[a, 1], body[c, 2] - body[a, 2]
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx

@@ -4,7 +4,7 @@
     SET/unseen.npy                 (count,) distance of each test sample to the training set, NaN for the others
     SET/shard-0-of-1/NAME.npy      S rows each; `columns_of` has their names, docs/guide/data.md what they are
 
-A row is written before its state is: what a killed process leaves half written is written again, to the same bytes.
+A row's state is written last: a row that a killed process left half written is written again, with the same bytes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from refu_core.simulation._selection import CAUSES
 FORMAT = "refu-garments-2"
 SEQUENCES = "refu-sequences-2"
 QUANTUM = 2.0**-14
-"""Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm an axis."""
+"""Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm per axis."""
 TO_DO, DONE, GIVEN_UP = 0, 1, 2
 _ROWS = "shard-0-of-1"
 _MAX_BYTES = 1 << 40
@@ -35,11 +35,11 @@ _MAX_ROWS = 1 << 22
 """The largest sets have a hundredth of that."""
 
 Columns = dict[str, tuple[tuple[int, ...], str]]
-"""Shape of a row and type, by the name of the file."""
+"""Shape of a row and type of its values, by the name of the file."""
 
 
 def columns_of(kind: str, shape: tuple[int, ...]) -> Columns:
-    """Columns of a set of the format `kind`, with garments of the shape (N, 3), or (T, N, 3) of T frames each."""
+    """Columns of a set of the format `kind`, with garments of the shape (N, 3), or (T, N, 3) for T frames each."""
     frames = shape[:-2]
     common: Columns = {
         "vertices": (shape, "<i2"),
@@ -90,10 +90,10 @@ def has_rows(output: Path) -> bool:
 
 
 class Rows:
-    """The rows of a set, a memory-mapped array a column."""
+    """The rows of a set, one memory-mapped array per column."""
 
     def __init__(self, output: Path, kind: str, *, mode: Literal["r", "r+"] = "r") -> None:
-        """Opens those of a set of the format `kind` to read (`r`) or to write (`r+`).
+        """Opens the rows of a set of the format `kind` for reading (`r`) or writing (`r+`).
 
         Raises `SimulationError` when files are missing or don't fit together.
         """
@@ -117,9 +117,9 @@ class Rows:
 
     @staticmethod
     def create(output: Path, kind: str, slots: NDArray[np.int32], shape: tuple[int, ...]) -> None:
-        """Lays out rows for these slots (S,) with garments of this shape, with all their room on disk reserved.
+        """Lays out rows for these slots (S,) with garments of this shape, and reserves all their space on disk.
 
-        Raises `SimulationError` when the disk hasn't the room, or can't be written.
+        Raises `SimulationError` when the disk hasn't enough space, or can't be written.
         """
         columns = columns_of(kind, shape)
         size = sum(len(slots) * int(np.prod(row)) * np.dtype(dtype).itemsize for row, dtype in columns.values())
@@ -156,7 +156,7 @@ class Rows:
 
 
 def _mapped(path: Path, mode: Literal["r", "r+"] = "r") -> NDArray[Any]:
-    """An array of a set, memory-mapped. Raises `SimulationError` where the file isn't a whole one."""
+    """An array of a set, memory-mapped. Raises `SimulationError` where the file isn't complete."""
     try:
         with open_file(path, most=_MAX_BYTES, error=SimulationError, wanted="a column of a data set") as file:
             rows = check_npy(file, file.size)[0][:1]  # numpy would lengthen a file that was cut short
@@ -171,13 +171,13 @@ def _mapped(path: Path, mode: Literal["r", "r+"] = "r") -> NDArray[Any]:
 
 
 def locked(output: Path) -> AbstractContextManager[None]:
-    """Keeps other runs out of a set's rows while they are written. Raises `SimulationError` when another has it."""
+    """Keeps other runs out of a set's rows while they are written. Raises `SimulationError` if another run has them."""
     msg = f"{output}: another run writes this set; wait for it"
     return exclusive(output / _ROWS / "lock", error=SimulationError(msg))
 
 
 def read_card(directory: Path, *kinds: str) -> dict[str, Any]:
-    """The card of a data set of one of these formats. Raises `SimulationError` for none, and one of another format."""
+    """The card of a data set of one of these formats. Raises `SimulationError` for none or another format."""
     path = directory / "card.json"
     card = read_json(path, error=SimulationError, wanted="the card of a simulated data set")
     got = card.get("format") if isinstance(card, dict) else None
@@ -195,13 +195,13 @@ def write_card(directory: Path, card: dict[str, Any]) -> None:
 
 
 def write_unseen(directory: Path, values: NDArray[np.float32]) -> None:
-    """Writes how far off the training set each slot's sample is (count,), in one step."""
+    """Writes the distance of each slot's sample to the training set (count,), in one step."""
     with replacing(directory / "unseen.npy") as file:
         np.save(file, values)
 
 
 def read_unseen(directory: Path, count: int) -> NDArray[np.float32]:
-    """What `write_unseen` has written; NaN as long as it hasn't. Raises `SimulationError` for a damaged file."""
+    """What `write_unseen` has written; NaN until it has. Raises `SimulationError` for a damaged file."""
     path = directory / "unseen.npy"
     if not path.exists():
         return np.broadcast_to(np.float32(np.nan), count)

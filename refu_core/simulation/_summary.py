@@ -1,4 +1,4 @@
-"""What there is in a set: counts and yield for its card, and what is known of each slot once it is done."""
+"""What a set contains: counts and yield for its card, and how far test samples are from the training set."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, SEQUENCES, Rows,
 
 
 def summarise(output: str | Path) -> dict[str, Any]:
-    """Brings a set's card up to date: counts, yield by cause, stretch, pace; of samples `unseen.npy`, too.
+    """Brings a set's card up to date: counts, yield by cause, stretch, pace; for samples, `unseen.npy`, too.
 
     A test sample's distance to the training set is the smallest Euclidean one in (θ, β, γ), as in the paper's
     supplement; it is in `unseen.npy`, by slot.

@@ -1,4 +1,4 @@
-"""Levelling cloth that has come to rest through itself, in a crease narrower than its mesh can show."""
+"""Smooths cloth that has come to rest intersecting itself, in a crease narrower than its mesh can show."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32
 
 _ROUNDS = 8
-"""Most rounds. Nearly all that can be levelled is in one to three, each over a wider part of the cloth."""
+"""Most rounds. Nearly all that can be resolved takes one to three, each over a wider part of the cloth."""
 _RINGS = 2
-"""Neighbours of faces that intersect, and theirs, that a round levels with them."""
+"""Rings of neighbours around intersecting faces that a round smooths with them."""
 _SWEEPS = (4, 5)
-"""Of a round: pushes off the skin, and sweeps of levelling before each."""
+"""Per round: pushes off the skin, and smoothing sweeps before each push."""
 
 
 class Untangle:
-    """Levels a settled garment where its own faces intersect, as in the crook of an elbow bent by 2 rad.
+    """Smooths a settled garment where its own faces intersect, as in the crook of an elbow bent by 2 rad.
 
-    Two layers and their folds have no room there, and where vertices are kept off faces alone, edges slip through each
-    other. The vertices around give way to the mean of their neighbours and are then pushed off the skin, as ReFU does.
+    There is no room there for two layers and their folds, and as only vertices are kept off faces, edges slip through
+    each other. Vertices around move towards the mean of their neighbours and are then pushed off the skin, as in ReFU.
     """
 
     def __init__(self, mesh: Connectivity, sdf: ExactSdf, *, margin: float) -> None:
-        """For a garment, above the body behind `sdf` by `margin` [m]."""
+        """For a garment that is kept `margin` above the body behind `sdf` [m]."""
         self._faces, self._sdf, self._margin = np.asarray(mesh.faces), sdf, margin
         around = mesh.adjacency_matrix()
         share = around.multiply(1 / np.maximum(around.sum(1), 1)[:, None])
@@ -36,9 +36,9 @@ class Untangle:
         self._sheet = SheetChecker(self._faces)
 
     def __call__(self, vertices: F32, body: F32) -> F32:
-        """Vertices (N, 3) of the garment on a body (V, 3) [m]: the very same where no faces intersect.
+        """Smoothed vertices (N, 3) of the garment on a body (V, 3) [m]: the very same array if no faces intersect.
 
-        Where no round helps, some still do.
+        Some faces may still intersect after the last round.
         """
         points, is_loose = vertices, np.zeros(len(vertices), np.bool_)
         for round_ in range(_ROUNDS):

@@ -21,12 +21,12 @@ from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
 from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, dequantise, quantise
 
 FARTHEST = 1.9
-"""Cloth farther off along an axis [m] is lost: `quantise` hasn't much more room."""
+"""Cloth farther away along an axis [m] counts as lost: `quantise` doesn't reach much farther."""
 
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """All settings of a data set but its plan."""
+    """All settings of a data set except its plan."""
 
     drape: DrapeSettings = field(default_factory=DrapeSettings)
     selection: SelectionSettings = field(default_factory=SelectionSettings)
@@ -35,7 +35,7 @@ class SimulationSettings:
 
 
 class Simulator(ABC):
-    """Makes the row of any slot of a set, in any order, the same every time; each process has its own."""
+    """Makes the row of any slot of a set, in any order, the same every time; each process has its own simulator."""
 
     kind: ClassVar[str]
     """Format of the set."""
@@ -47,9 +47,9 @@ class Simulator(ABC):
         settings: SimulationSettings,
         body: str | Path | None,
     ) -> None:
-        """For the clips of the training and of the test set, on a body or (None) the one the garment is cut for.
+        """For clips of the training and the test set, on `body`, or on the one the garment is cut for if None.
 
-        Raises `SimulationError` for garments of different bodies, others as loaders and `Draper` do.
+        Raises `SimulationError` for garments of different bodies, and what loaders and `Draper` raise.
         """
         self.plan = plan
         self.settings = settings
@@ -63,7 +63,7 @@ class Simulator(ABC):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a row's garment."""
+        """Shape of a row's garment."""
         return (self.garment.n_vertices, 3)
 
     def block(self, slots: list[int]) -> list[dict[str, Any]]:
@@ -75,7 +75,7 @@ class Simulator(ABC):
         """The columns of a slot's row (see `_store`)."""
 
     def _examine(self, vertices: F32, body: F32, *, stretch: float, speed: float = 0.0) -> tuple[str | None, Any]:
-        """The cause against cloth, and the cloth as it is stored: None where it is lost, not finite or too far off."""
+        """Why cloth is rejected, if it is, and the cloth as stored: None where it isn't finite or is too far off."""
         if not np.abs(vertices).max() <= FARTHEST:
             return "unsettled", None
         stored = quantise(vertices)

@@ -1,8 +1,8 @@
-"""Networks of few samples: those of a related garment, carried over, and what the samples add to them.
+"""Networks from few samples: those of a related garment, carried over, and what the samples add to them.
 
-A hundred simulated samples teach a network from scratch little. A T-shirt of another cut, on another body, falls much
-like the one whose networks learnt from a thousand: where it lies near that one, it moves as that one does, as far as
-the samples bear that out. What is left, the samples say, as a linear function of the pose.
+A network learns little from a hundred simulated samples alone. But a T-shirt of another cut, on another body, falls
+much like the one whose networks learnt from a thousand. Where it lies near that one, it moves as that one does, as far
+as the samples bear that out. The rest is fitted to the samples, as a linear function of the pose.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ from refu_core.weights import load_weights, save_weights
 
 _CHUNK = 32
 _DOUBT = 0.1
-"""Where less than this share of the mean is carried over, nothing is said for it."""
+"""Damps what is carried over where it varies by less than about this share of its mean variation."""
 BASE = SdfMode.HYBRID
-"""The mode whose file has the network; the other modes' files only name it."""
+"""The mode whose file has the network; the other modes' files only refer to it."""
 
 
 @dataclass(frozen=True)
@@ -61,24 +61,24 @@ class CarrySettings:
 
     loop: LoopSettings = field(default_factory=lambda: LoopSettings(weight_decay=0.01, check_every=500))
     rank: int = 48
-    """Components of the output basis. 64 give a T-shirt .1 mm, and a third more bytes."""
+    """Components of the output basis. With 64 a T-shirt gains .1 mm, for a third more bytes."""
     controls: int = 200
     """Vertices at which the basis is stored. With 150 a T-shirt is .1 mm worse, with 600 no better."""
     hidden: tuple[int, ...] = (128, 128)
-    """Layers of the net that learns what was carried over."""
+    """Hidden layers of the net that learns what was carried over."""
     poses: int = 4000
-    """Bodies that it learns it of."""
+    """Bodies that this net learns from."""
     steps: int = 3000
     reach: float = 0.05
-    """Cloth that is nearer than this to the related garment, both in the T-pose, is moved as that is [m]."""
+    """Cloth nearer than this to the related garment, both in the T-pose, is moved as that garment is [m]."""
     fade: float = 0.05
-    """Way farther in which that ends [m]. A dress that hears of a skirt up to 45 mm away is 24 mm off, not 18."""
+    """Distance beyond `reach` over which it ends [m]. A dress led by a skirt up to 45 mm away errs by 24 mm, not 18."""
     hem: float = 0.12
-    """The related garment's hem is felt less and less within this of it [m], where the other garment goes on."""
+    """Within this of the related garment's hem its influence fades out [m], where the other garment goes on."""
     jitter: float = 0.15
     """Standard deviation by which poses of the set are varied [rad]."""
     ridge: float = 10.0
-    """Weight of the square of the linear part's coefficients. With 3 and 30 it is .6 mm worse at most, or better."""
+    """Weight of the square of the linear part's coefficients. With 3 and 30 it is at most .6 mm worse, or better."""
 
     def __post_init__(self) -> None:
         """Raises `RefuError` for sizes that make no network."""
@@ -88,17 +88,17 @@ class CarrySettings:
 
 
 class Carried:
-    """What the networks of one garment predict, on another.
+    """What the networks of one garment predict, applied to another.
 
-    Cloth is moved and posed as what it lies near, with the skinning weights that this has there: a displacement is
-    worth what its garment's weights make of it. With a garment's own weights a hem that hangs 100 mm off a person who
-    bends would be elsewhere, in the reach of the hands.
+    Cloth is moved and posed as the related garment is where the two lie near each other, with that garment's skinning
+    weights: a displacement makes sense only with the weights that pose it. With the other garment's own weights, a hem
+    that hangs 100 mm off a person who bends would end up elsewhere, within reach of the hands.
     """
 
     def __init__(
         self, related: GarmentTemplate, garment: GarmentTemplate, body: SmplBody, settings: CarrySettings
     ) -> None:
-        """For `garment` on its `body`, near which `related` lies once it is worn on the same body.
+        """For `garment` on its `body`; `related` lies near the garment once it is worn on the same body.
 
         Raises `WeightsError` when no networks of `related` ship.
         """
@@ -109,7 +109,7 @@ class Carried:
         vertices = garment.v_template.double().numpy()
         nearest, place, distance = SurfaceMixture.nearest(worn, vertices)
         share = _smooth((settings.reach + settings.fade - distance) / settings.fade)
-        # Trousers go on where shorts end: a hem that swings there would be a step in them.
+        # Trousers go on where shorts end: if they followed the hem that swings there, they would have a step.
         ends = _from_rim(worn, place)
         goes_on = _smooth((_from_rim(garment, vertices) - ends) / settings.hem)
         share *= 1 - goes_on * _smooth(1 - ends / settings.hem)
@@ -134,7 +134,7 @@ class Carried:
 
 
 def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From 0 to 1, level at both ends, for shares cut off there."""
+    """Smoothstep of shares cut off at 0 and 1: from 0 to 1, level at both ends."""
     cut: NDArray[np.float64] = np.clip(share, 0, 1)
     return cut * cut * (3 - 2 * cut)
 
@@ -155,11 +155,11 @@ def carry_over(
     body: SmplBody | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Makes a garment's networks of those of a related one and few samples; writes `output`/basis and all modes.
+    """Makes a garment's networks from those of a related one and few samples; writes `output`/basis and all modes.
 
     Args:
         garment: as in `pretrain`; on its own body.
-        dataset: as in `pretrain`; fifty samples are worth it.
+        dataset: as in `pretrain`; fifty samples are enough to be useful.
         output: folder of the weights.
         like: name of the related garment, one whose networks ship.
         settings: the default ones if not given.
@@ -185,7 +185,7 @@ def carry_over(
     share = _borne_out(carried(samples.betas, samples.pose), samples.displacement, controls)
     drawn = _bodies(opened.samples, settings)
     there = share[:, None] * carried(*drawn)
-    # As many of either: the samples' own folds must have their components.
+    # As many of each: the folds of the samples need components of their own.
     basis = _smooth_basis(torch.cat((samples.displacement, there[: len(samples)])), controls, settings.rank)
     described = {**opened.identity, "samples": len(samples), "simulated": len(opened.samples), "like": like}
     save_basis(output, basis, {**described, "set": len(opened.rows)})
@@ -227,7 +227,8 @@ def carry_over(
 def _borne_out(carried: Tensor, truth: Tensor, controls: Controls) -> Tensor:
     """How much of what is carried over (N, V, 3) varies as the truth does, from 0 to 1, smoothly over the cloth, (V,).
 
-    A sleeve moves as the related garment's, a hem that is cut wider may not: least squares in each neighbourhood.
+    A sleeve moves as the related garment's does; a hem that is cut wider may not. It is found by least squares in each
+    neighbourhood.
     """
     carried, truth = carried - carried.mean(0), truth - truth.mean(0)
     common, own = (carried * truth).sum((0, 2)), (carried * carried).sum((0, 2))
@@ -239,18 +240,18 @@ def _borne_out(carried: Tensor, truth: Tensor, controls: Controls) -> Tensor:
 
 
 def _smooth_basis(displacement: Tensor, controls: Controls, rank: int) -> BasisDecoder:
-    """The output basis of displacements (N, V, 3) [m], of what of them is known at `controls`."""
+    """The output basis of displacements (N, V, 3) [m], limited to fields that `controls` can represent."""
     field = controls.matrix()
     smooth, triangle = torch.linalg.qr(field)
     at = torch.einsum("vc,nvk->nck", smooth, displacement)
-    mean, components = principal_components(at, rank=rank)  # smooth's columns are orthonormal: as over all vertices
+    mean, components = principal_components(at, rank=rank)  # orthonormal columns: as over all vertices
     both = torch.cat((mean.flatten()[None], components)).view(-1, *mean.shape)
     mean, components = torch.linalg.solve_triangular(triangle, both, upper=True).flatten(1).tensor_split((1,))
     return BasisDecoder(mean.view(-1, 3), components, controls=controls)
 
 
 def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, Tensor]:
-    """β (P, 10) and θ (P, 24, 3) [rad] to ask a network about: poses near the set's, and any that joints allow."""
+    """β (P, 10) and θ (P, 24, 3) [rad] to query a network at: poses near the set's, and any that joints allow."""
     rng = np.random.default_rng(settings.loop.seed)
     known = samples.pose.numpy()[rng.integers(len(samples), size=settings.poses)]
     known = known + rng.normal(0, settings.jitter, known.shape)
@@ -277,7 +278,7 @@ def _learn_carried(
     code = in_chunks(model.decoder.encode, there, size=256)
     bounded = model.features.are_bounded(garment)
     model.low.standardise(torch.cat((x, s), 1), model.features.groups, is_bounded=bounded)
-    model.low.scale[-N_STYLES:] = 0  # a garment of one style doesn't hear of any
+    model.low.scale[-N_STYLES:] = 0  # a garment of one style ignores γ
     held_out = len(x) // 12
     parts = [(x[rows], s[rows], code[rows]) for rows in (slice(held_out, None), slice(held_out))]
     loop = Loop(
@@ -296,7 +297,7 @@ def _learn_carried(
 
 @torch.no_grad()
 def _add_linear(model: TailorNet, samples: TrainingSamples, ridge: float) -> None:
-    """Fits the high-frequency net, one layer, to what the low-frequency one leaves of the samples."""
+    """Fits the high-frequency net, a single layer, to what the low-frequency one doesn't explain of the samples."""
     model.eval()
     assert isinstance(model.decoder, BasisDecoder)
     x = model.features(samples.pose)

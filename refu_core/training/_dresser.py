@@ -22,9 +22,9 @@ Sdf = Literal["accurate", "approx"]
 class Dresser(nn.Module):
     """Bodies to garments after ReFU, differentiable with respect to the networks.
 
-    A distance's own derivative, ∇f, is kept; the direction of a push is held fixed. Its derivative, the curvature of
-    the skin, would turn a push of some mm by a few degrees, and costs a graph through the closest triangles. (Both are
-    there for who needs them: `BodySdf.query` is differentiable.)
+    The derivative of a distance, ∇f, is kept; the direction of a push is held fixed. The derivative of that direction,
+    the curvature of the skin, would turn a push of some mm by a few degrees, and would cost a graph through the closest
+    triangles. (Both are available where they are needed: `BodySdf.query` is differentiable.)
     """
 
     def __init__(
@@ -38,13 +38,13 @@ class Dresser(nn.Module):
         in_loss: Sdf,
         is_blended: bool = True,
     ) -> None:
-        """For one garment on its body, both on one device; without `refu` the garment stays as it is predicted.
+        """For one garment on its body, both on one device; without `refu` the garment stays as predicted.
 
-        `in_refu` is the distance that ReFU sees, `in_loss` the one that is returned. Blended, pushed vertices take
-        their neighbourhood along.
+        `in_refu` is the distance that ReFU sees, `in_loss` the one that is returned. If `is_blended`, pushed vertices
+        take their neighbourhood along.
         """
         super().__init__()
-        self.backbone, self.refu = backbone, refu  # modules, whose weights are this one's, too
+        self.backbone, self.refu = backbone, refu  # submodules: their weights are this module's, too
         self._garment = garment
         self._network = _InPrecision(backbone)
         wearable = Wearable(garment, self._network, refu, 0.0)
@@ -56,7 +56,7 @@ class Dresser(nn.Module):
     def forward(self, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
         """Garments [m] for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4), shape (B, N, 4).
 
-        The fourth coordinate is the signed distance to the body [m], exact where that is less than the margin.
+        The fourth coordinate is the signed distance to the body [m], which may be clipped beyond `BAND`.
         """
         name, kind = self._garment.name, betas.device.type
         self._network.is_low, self._network.dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
@@ -79,7 +79,7 @@ class Dresser(nn.Module):
 
 @dataclass(eq=False)
 class _InPrecision:
-    """A backbone in the precision that the training loop asks for, in the midst of what needs float32."""
+    """A backbone run in the precision that the training loop asks for, inside code that needs float32."""
 
     heeds_past = False
     backbone: Backbone
@@ -99,7 +99,7 @@ class _InPrecision:
 
 
 class _Distances:
-    """The distances of a batch of garments to their own bodies, with the derivative that `Dresser` speaks of."""
+    """The distances of a batch of garments to their own bodies, with the derivative that `Dresser` describes."""
 
     def __init__(self, name: Sdf, garment: GarmentTemplate, body: SmplBody) -> None:
         self._sdf: BodySdf = ApproxSdf(body) if name == "approx" else exact_sdf(body)

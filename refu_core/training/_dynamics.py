@@ -1,4 +1,4 @@
-"""Training of what a garment owes to motion, on top of a backbone for cloth at rest."""
+"""Training of what motion does to a garment, on top of a backbone for cloth at rest."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ class DynamicsSettings:
     loop: LoopSettings = field(default_factory=lambda: LoopSettings(weight_decay=0.3))
     steps: int = 3000
     noise: float = 0.02
-    """Standard deviation of what is added to each number of the past [1, m]. Without it nobody in the set stands as
-    still as a person who is told with a little noise, and cloth trembles: joints by 0.1 degrees and the root by 3 mm
-    shake a skirt by 2.1 mm from frame to frame, 0.7 without dynamics; with 0.01 by 1.1, with 0.03 by 0.7. The error on
-    other sequences is 11.7, 11.7 and 11.8 mm, 14.0 without dynamics."""
+    """Standard deviation of the noise added to each number of the past [1, m]. Without it the training set has nobody
+    who stands still but is observed with a little noise, and cloth trembles: noise of 0.1 degrees in joints and 3 mm in
+    the root shakes a skirt by 2.1 mm from frame to frame (0.7 without dynamics); with 0.01 by 1.1, with 0.03 by 0.7.
+    The error on other sequences is 11.7, 11.7 and 11.8 mm (14.0 without dynamics)."""
     validation_share: float = 0.15
-    """Of the sequences, whole ones."""
+    """Share held out for validation, as whole sequences."""
 
 
 class _Prepared(NamedTuple):
-    """What the loop draws from."""
+    """The data that the loop draws from."""
 
     features: Tensor
-    """Of poses, shape (N, I)."""
+    """Features of the poses, shape (N, I)."""
     style_shape: Tensor
     """(β, γ), shape (N, 14)."""
     past: Tensor
     """Shape (N, 4, 219)."""
     code: Tensor
-    """Of the simulated cloth less that of cloth at rest, shape (N, R)."""
+    """Code of the simulated cloth minus that of cloth at rest, shape (N, R)."""
 
 
 def train_dynamics(
@@ -67,12 +67,12 @@ def train_dynamics(
 ) -> dict[str, Any]:
     """Trains what moving cloth does beyond the garment's tailornet in `folder`, and writes `folder`/dynamics.
 
-    Interrupted, the same call goes on from the last checkpoint.
+    If interrupted, the same call goes on from the last checkpoint.
 
     Args:
         dataset: simulated sequences (`refu simulate --sequences`).
         folder: holds tailornet-<mode> and its basis, which are left as they are.
-        mode: whose tailornet; modes that share one share the dynamics, too.
+        mode: mode of the tailornet; modes that share one share the dynamics, too.
         settings: the default ones if not given.
         garment, body, device, quiet: as in `pretrain`.
 
@@ -80,8 +80,8 @@ def train_dynamics(
         The card: what was trained on what, and its figures on test sequences, beside those of the tailornet alone.
 
     Raises:
-        RefuError: no set of sequences, one of another garment or body, without a test or with too few, or a checkpoint
-            there is of another training.
+        RefuError: the set isn't of sequences, is of another garment or body, has no test split or too few sequences, or
+            a checkpoint there is of another training.
         WeightsError: no tailornet there, or a damaged one.
     """
     opened = TrainingSet.of(garment, dataset, body)
@@ -89,7 +89,7 @@ def train_dynamics(
     if not isinstance(rows, GarmentSequences):
         msg = f"dynamics are learnt from sequences, got samples at rest: refu simulate {template.name} --sequences"
         raise RefuError(msg)
-    test = read_samples(rows, body, template, split="test")  # what there is none of is said before any work
+    test = read_samples(rows, body, template, split="test")  # a missing test split is reported before any work
     stored = load_weights(folder / f"tailornet-{mode}", expect=opened.identity)
     still = backbone_from_weights(stored, template)
     if not isinstance(still, TailorNet):
@@ -141,7 +141,7 @@ def train_dynamics(
 
 
 def _pasts(dataset: GarmentSequences, rows: NDArray[np.bool_], *, is_mirrored: bool = False) -> Tensor:
-    """The past of every good frame of some sequences, shape (N, 4, 219), in the order of `read_samples`."""
+    """The past of every kept frame of some sequences, shape (N, 4, 219), in the order of `read_samples`."""
     found = []
     for row in np.flatnonzero(rows):
         sequence = dataset.sequence(int(row))
@@ -168,8 +168,8 @@ def _prepared(still: TailorNet, samples: TrainingSamples, past: Tensor) -> _Prep
 def _split(
     samples: TrainingSamples, prepared: tuple[_Prepared, _Prepared], settings: DynamicsSettings
 ) -> tuple[_Prepared, _Prepared]:
-    """To learn from, mirrored ones included, and to choose by."""
-    which = replace(samples, displacement=torch.arange(len(samples)))  # their numbers, to split those
+    """Samples to learn from, mirrored ones included, and samples for validation."""
+    which = replace(samples, displacement=torch.arange(len(samples)))  # sample numbers, to split those
     train, validation = split_validation(which, share=settings.validation_share, seed=settings.loop.seed)
     plain, turned = prepared
     to_learn = [torch.cat((a[train.displacement], b[train.displacement])) for a, b in zip(plain, turned, strict=True)]

@@ -28,7 +28,7 @@ def displacements(backbone: Backbone, samples: TrainingSamples) -> Tensor:
 
 @torch.no_grad()
 def posed_errors(predicted: Tensor, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> Tensor:
-    """Distances of posed vertices [mm], shape (N, V), of predicted displacements (N, V, 3) [m] (the paper's MPVE)."""
+    """Errors of posed vertices [mm], shape (N, V), for predicted displacements (N, V, 3) [m] (the paper's MPVE)."""
 
     def error(predicted: Tensor, truth: Tensor, pose: Tensor, betas: Tensor) -> Tensor:
         rotation = garment.vertex_transforms(body(pose, betas).transforms).rotation
@@ -39,17 +39,17 @@ def posed_errors(predicted: Tensor, samples: TrainingSamples, body: SmplBody, ga
 
 
 def mpve(predicted: Tensor, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> float:
-    """Their mean [mm]."""
+    """Mean of `posed_errors` [mm]."""
     return round(float(posed_errors(predicted, samples, body, garment).mean()), 3)
 
 
 def backbone_figures(
     backbone: Backbone, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate, *, mean: Tensor
 ) -> dict[str, Any]:
-    """MPVE on the test split [mm], beside what it is to be measured against.
+    """MPVE on the test split [mm], beside baselines to compare it with.
 
-    `skinned_mm` is without a network, `mean_mm` (`mean`, shape (V, 3)) the best constant, and `basis_mm` the least that
-    the output basis allows.
+    `skinned_mm` is without a network, `mean_mm` with the best constant displacement (`mean`, shape (V, 3)), and
+    `basis_mm` the least that the output basis allows.
     """
 
     truth, decoder = samples.displacement, getattr(backbone, "decoder", None)

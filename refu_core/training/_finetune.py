@@ -32,7 +32,7 @@ from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis
 from refu_core.weights import load_weights
 
 _UNIT = 1e3
-"""What the loss is multiplied by, so that its curves are numbers to read. Adam doesn't see it."""
+"""Factor on the loss, so that its curves show readable numbers. It makes no difference to Adam."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ _MODES: dict[str, _Mode] = {
     "collision-accurate": _Mode(None, "accurate", 1.0),
 }
 FINETUNE_MODES: tuple[str, ...] = tuple(_MODES)
-"""The paper's three settings: approximate or accurate distance everywhere; hybrid, accurate in the loss and approximate
-in ReFU. And its baseline, a collision loss without ReFU, by either distance."""
+"""The paper's three settings: approximate or accurate distance everywhere; or hybrid, accurate in the loss and
+approximate in ReFU. And its baseline, a collision loss without ReFU, with either distance."""
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,17 @@ class FinetuneSettings:
     """Whether pushed vertices take their neighbourhood along in training, as they do at run time."""
     is_mirrored: bool = True
     validation_share: float = 0.08
-    """The share that pre-training held out, so that it is the same samples: see `split_validation`."""
+    """The same share as in pre-training, so that the same samples are held out: see `split_validation`."""
 
     @classmethod
     def paper(cls) -> FinetuneSettings:
-        """The paper's own (Sec. 4.2): Adam with 1e-5, networks of 1024, ε = 0, no blending."""
+        """The paper's settings (Sec. 4.2): Adam with 1e-5, networks of 1024, ε = 0, no blending."""
         loop = LoopSettings(batch_size=32, learning_rate=1e-5, weight_decay=0.0, check_every=1000)
         return cls(loop, steps=100_000, scale="paper", margin=0.0, is_blended=False, is_mirrored=False)
 
     @classmethod
     def of(cls, backbone: str, preset: str = "realtime") -> FinetuneSettings:
-        """A backbone's own in a preset. The gcnn is trained from scratch, so as long and as fast as it is alone."""
+        """A backbone's settings in a preset. The gcnn starts from scratch, so steps and rates are as in `pretrain`."""
         if preset == "paper":
             return cls.paper()
         alone = PretrainSettings.of(backbone)
@@ -105,7 +105,7 @@ def finetune(
 ) -> dict[str, Any]:
     """Trains a backbone together with ReFU and writes `output`/<backbone>-<mode>.
 
-    Interrupted, the same call goes on from the last checkpoint. Under `torchrun` all processes make one training.
+    If interrupted, the same call goes on from the last checkpoint. Under `torchrun` all processes share one training.
 
     Args:
         weights: folder with <backbone>-none and its basis, as `pretrain` wrote them; None to train from scratch, as the
@@ -145,7 +145,7 @@ def finetune(
             if uses_basis(config, preset):
                 basis = basis_of(output, opened, None, PretrainSettings().rank)
             network = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
-            # For the scale of inputs and outputs, which it sets; the stages themselves aren't run.
+            # Called because it sets the scale of inputs and outputs; the stages themselves aren't run.
             stages(network, train, validation, template, PretrainSettings())
         else:
             stored = load_weights(Path(weights) / f"{backbone}-none", expect=identity)
@@ -175,7 +175,7 @@ def finetune(
     loop = Loop(dresser, settings.loop, folder=output, name=name, identity=described, device=torch_device, quiet=quiet)
 
     def loss(dressed: Tensor, truth: Tensor) -> Tensor:
-        """Of garments with their distance, (B, N, 4), and the true garments, (B, N, 3) [m]."""
+        """Loss of garments with their distance, (B, N, 4), against the true garments, (B, N, 3) [m]."""
         return _UNIT * refu_loss(dressed[..., :3], truth, dressed[..., 3])
 
     objective = Objective([dresser], dresser, loss)
@@ -197,7 +197,7 @@ def finetune(
 
 @torch.no_grad()
 def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
-    """What the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
+    """The data that the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
     along = TakenAlong(body, garment)
 
     def posed(displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:

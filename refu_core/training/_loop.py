@@ -1,4 +1,4 @@
-"""The loop that trains one stage: AdamW, a cosine of learning rates, checkpoints, the best by validation is kept."""
+"""The loop that trains a stage: AdamW, a cosine schedule, checkpoints; the best weights by validation are kept."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ class LoopSettings:
     """How a stage is trained."""
 
     batch_size: int = 64
-    """Over all processes."""
+    """Samples per step, over all processes."""
     learning_rate: float = 1e-3
-    """At its highest; it rises over the first twentieth of the steps and falls to nothing as a cosine."""
+    """The peak: the rate rises over the first twentieth of the steps and then falls to zero along a cosine."""
     weight_decay: float = 1.0
-    """Decoupled from the gradient (AdamW): a weight shrinks by this times the learning rate a step."""
+    """Decoupled from the gradient (AdamW): each step shrinks a weight by this times the learning rate."""
     check_every: int = 100
     """Steps between validations, which are also the checkpoints."""
     patience: int = 15
-    """A stage ends early after so many validations without a better one."""
+    """A stage ends early after this many validations without a better one."""
     seed: int = 0
 
 
 class Objective(nn.Module):
-    """Networks and their loss as one module: what a step is, and what is wrapped for several GPUs."""
+    """Networks and their loss as one module: what a step calls, and what is wrapped for several GPUs."""
 
     def __init__(self, nets: Sequence[nn.Module], predict: Callable[..., Tensor], loss: Callable[..., Tensor]) -> None:
         super().__init__()
@@ -60,13 +60,13 @@ class TrainingStage:
     train: tuple[Tensor, ...]
     """Inputs and, last, targets; each of the shape (N, ...)."""
     validation: tuple[Tensor, ...]
-    """The same of the samples to choose by; possibly none."""
+    """The same for the validation samples, of which there may be none."""
     rate: float = field(default=1.0, kw_only=True)
     """Learning rate, relative to the settings'."""
 
 
 class Loop:
-    """Runs stages one after another; interrupted, goes on where the last checkpoint was, to the same weights."""
+    """Runs stages one after another; if interrupted, it goes on from the last checkpoint to the same weights."""
 
     def __init__(
         self,
@@ -102,7 +102,7 @@ class Loop:
     def run(self, stage: TrainingStage) -> None:
         """Trains a stage, or what is left of it.
 
-        The model ends with the stage's best weights by validation, or with its last ones where none is held out.
+        The model ends with the stage's best weights by validation, or with its last ones where no samples are held out.
         """
         if stage.name in self._done:
             return
@@ -193,15 +193,15 @@ class Loop:
         return total / n
 
     def _save(self, stage: dict[str, Any] | None) -> None:
-        # One process' word is enough: after a step all have the same weights. Its random state is its own, though, so
-        # a resumed parallel run is sound but not the same bit for bit.
+        # One process's state is enough: after a step all have the same weights. Each has its own random state, though,
+        # so a resumed parallel run is sound but not the same bit for bit.
         if is_writer():
             state = {"identity": self._identity, "done": self._done, "stage": stage, "model": self._model.state_dict()}
             save_checkpoint(self.checkpoint, state)
 
 
 def start_parallel(device: str) -> torch.device:
-    """Joins the other processes of a `torchrun`; the device that is this one's own."""
+    """Joins the other processes of a `torchrun`; returns this process's own device."""
     own = torch.device(device)
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return own
@@ -231,5 +231,5 @@ def _schedule(step: int, steps: int) -> float:
 
 
 def cosine(step: int, steps: int) -> float:
-    """A learning rate that falls to nothing, as a share of the highest one."""
+    """A learning rate that falls to zero along a cosine, as a share of the highest one."""
     return 0.5 * (1 + math.cos(math.pi * step / max(1, steps)))

@@ -1,4 +1,4 @@
-"""The losses that a backbone with ReFU is trained by (paper, Sec. 3.2)."""
+"""The losses that a backbone with ReFU is trained with (paper, Sec. 3.2)."""
 
 from __future__ import annotations
 

@@ -15,23 +15,23 @@ from refu_core.errors import GarmentError
 from refu_core.garments import GarmentTemplate
 
 MAX_ASYMMETRY = 5e-3
-"""A template that is farther from its own mirror image anywhere has none [m]."""
+"""A template that is anywhere farther than this from its mirror image counts as asymmetric [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMixture:
-    """Places on a garment: each lies in a triangle, and takes a mixture of its three corners."""
+    """Places on a garment: each lies in a triangle, and takes a weighted mean of the values at its three corners."""
 
     corners: Tensor
     """Vertices of the triangles, shape (P, 3), int64."""
     weights: Tensor
-    """How much each of them counts, shape (P, 3)."""
+    """How much each corner counts, shape (P, 3)."""
 
     @staticmethod
     def nearest(
         garment: GarmentTemplate, points: NDArray[np.float64]
     ) -> tuple[SurfaceMixture, NDArray[np.float64], NDArray[np.float64]]:
-        """Those nearest to points (P, 3) [m]; where they are [m], (P, 3), and how far off, (P,)."""
+        """The places nearest to points (P, 3) [m]; their positions [m], (P, 3), and distances [m], (P,)."""
         vertices, faces = garment.v_template.cpu().double().numpy(), garment.faces.cpu().numpy()
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         places, distance, triangle = trimesh.proximity.closest_point(mesh, points)
@@ -39,7 +39,7 @@ class SurfaceMixture:
         return SurfaceMixture(torch.as_tensor(faces[triangle]), torch.as_tensor(barycentrics)), places, distance
 
     def __call__(self, values: Tensor) -> Tensor:
-        """Of values at the garment's vertices (B, V, K) those at the places, shape (B, P, K)."""
+        """Values at the places, shape (B, P, K), from values at the garment's vertices (B, V, K)."""
         weights = self.weights.to(values.dtype)
         corners = (weights[:, k, None] * values[:, self.corners[:, k]] for k in range(3))
         return sum(corners, start=torch.zeros(()))
@@ -54,8 +54,8 @@ def mirror_pose(pose: Tensor) -> Tensor:
 class Mirror:
     """Where each vertex of a garment lies in its mirror image.
 
-    The garments' meshes aren't symmetric, their surfaces are: a mirrored vertex lies in a triangle, and takes a
-    mixture of its three corners. The body and the bases of shape and style are symmetric, so β and γ stay.
+    The garments' surfaces are symmetric, but their meshes aren't: a mirrored vertex lies in a triangle, and takes a
+    weighted mean of its three corners. The body and the bases of shape and style are symmetric, so β and γ stay.
     """
 
     image: SurfaceMixture
@@ -71,6 +71,6 @@ class Mirror:
         return Mirror(image)
 
     def displacement(self, displacement: Tensor) -> Tensor:
-        """Displacements of the mirrored garment, of `displacement`; both (B, V, 3) [m]."""
+        """Displacements of the mirrored garment, from `displacement`; both (B, V, 3) [m]."""
         mixed = self.image(displacement)
         return mixed * mixed.new_tensor((-1.0, 1.0, 1.0))

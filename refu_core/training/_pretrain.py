@@ -54,9 +54,9 @@ from refu_core.training._rehearsal import Rehearsal, plans_of
 from refu_core.weights import load_weights
 
 MANY = 4000
-"""Samples from which on a tailornet is trained longer and held back less. On validation samples of shorts' 6,000 the
-error is 7.61 mm with weight decay 1 and twice the steps, 7.21 with 0.3, 7.18 with half the dropout, 7.04 with 0.1 (on
-the test split 6.68, 6.43, 6.39 and 6.36); a T-shirt's 2,580 gain nothing (test: 9.5, with 0.3 9.6)."""
+"""From this many samples on a tailornet is trained longer and regularised less. With 6,000 samples of shorts the
+validation error is 7.61 mm with weight decay 1 and twice the steps, 7.21 with 0.3, 7.18 with half the dropout, 7.04
+with 0.1 (on the test split 6.68, 6.43, 6.39 and 6.36); a T-shirt's 2,580 gain nothing (test: 9.5, with 0.3 9.6)."""
 
 
 @dataclass(frozen=True)
@@ -69,15 +69,15 @@ class PretrainSettings:
     style_shape_steps: int = 800
     low_steps: int = 5000
     steps: int = 3000
-    """Of the last stage; of the only one for backbones other than the tailornet. On test samples half of these and of
-    the low-frequency net's steps leave 11.3 mm, all 11.1 (a T-shirt's 980 samples)."""
+    """Steps of the last stage, which is the only one for backbones other than the tailornet. Half of these and of the
+    low-frequency net's steps leave a test error of 11.3 mm, all of them 11.1 (a T-shirt's 980 samples)."""
     is_joint: bool = True
     """Whether the high-frequency nets are trained through the mixture, on all samples and together with the
     low-frequency net, or each on its own pivot's samples, as in the original."""
     joint_rate: float = 0.3
-    """Learning rate of a joint last stage, relative: the low-frequency net is only tuned there."""
+    """Relative learning rate of a joint last stage: the low-frequency net is only fine-tuned there."""
     dropout: float | None = None
-    """Of a tailornet's low-frequency net, half that of its high-frequency nets; None for the configuration's."""
+    """Dropout in a tailornet's low-frequency net, half that in high-frequency nets; None for the configuration's."""
     is_mirrored: bool = True
     validation_share: float = 0.08
 
@@ -89,12 +89,12 @@ class PretrainSettings:
 
     @classmethod
     def of(cls, backbone: str, preset: str = "realtime", *, samples: int = 0) -> PretrainSettings:
-        """A backbone's own in a preset, for so many samples of a training split."""
+        """A backbone's settings in a preset, for this many samples of a training split."""
         if preset == "paper":
             return cls.paper()
         if backbone == "tailornet" and samples >= MANY:
             return cls(LoopSettings(weight_decay=0.1), low_steps=10_000, steps=6000, dropout=0.05)
-        # A gcnn's step costs many times one of a network with an output basis, and hardly gains from larger batches.
+        # A gcnn's step costs many times that of a network with an output basis, and larger batches hardly help.
         return cls(LoopSettings(batch_size=32, learning_rate=5e-3, weight_decay=0.1)) if backbone == "gcnn" else cls()
 
 
@@ -117,8 +117,8 @@ def pretrain(
 ) -> dict[str, Any]:
     """Trains the backbone of one garment and writes `output`/basis and `output`/<backbone>-<mode>.
 
-    A basis that is there already is used, so that all backbones and modes in a folder share it. Interrupted, the same
-    call goes on from the last checkpoint. Under `torchrun` all processes make one training.
+    A basis that is there already is used, so that all backbones and modes in a folder share it. If interrupted, the
+    same call goes on from the last checkpoint. Under `torchrun` all processes share one training.
 
     Args:
         garment: name of a built-in garment, or a template.
@@ -127,11 +127,11 @@ def pretrain(
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`.
         settings: the backbone's own in the preset if not given.
-        config: sizes of the network; the preset's if not given. One that goes on has its own.
-        start: folder of the weights and basis to go on from, with the last stage alone; None to start from scratch.
-        mode: which of the weights in `start` go on, and what is written; a ReFU layer stays as it is.
-        joints: numbers of joints that those weights are told of from now on, too; at first they change nothing.
-        rehearsal: what those weights are asked for beside the new samples.
+        config: sizes of the network; the preset's if not given. A network that goes on from `start` keeps its own.
+        start: folder of the weights and basis to go on from, by the last stage only; None to start from scratch.
+        mode: mode of the weights in `start` to go on from, and of those written; a ReFU layer stays as it is.
+        joints: numbers of further joints that the network sees from now on; at first they change nothing.
+        rehearsal: what the network rehearses beside the new samples.
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
         quiet: show no progress.
@@ -145,7 +145,7 @@ def pretrain(
     """
     opened = TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
-    test = read_samples(opened.rows, body, template, split="test")  # what there is none of is said before hours of work
+    test = read_samples(opened.rows, body, template, split="test")  # a missing test split is reported first
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
     if start is None and (rehearsal is not None or joints or mode != "none"):
         msg = "there is nothing to go on from or to rehearse without weights to start from"
@@ -155,7 +155,7 @@ def pretrain(
 
     mirror = Mirror.of(template) if settings.is_mirrored else None
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
-    # What rehearses can't stray far: with none of 500 samples held out, the last weights of shorts are 0.2 mm nearer.
+    # A rehearsing network can't stray far: with none of 500 samples held out, shorts' last weights are 0.2 mm nearer.
     held_out = 0.0 if rehearsal is not None else settings.validation_share
     train, validation = split_validation(samples, share=held_out, seed=settings.loop.seed)
     if mirror is not None:
@@ -182,7 +182,7 @@ def pretrain(
             train = train.joined(rehearsed)
             described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card, known=known)}
             for net in _of_pose(model):
-                net.dropout = 0.0  # what is rehearsed has no noise: with dropout a T-shirt was off by 0.2 mm more
+                net.dropout = 0.0  # rehearsed targets have no noise: with dropout a T-shirt was off by 0.2 mm more
         if joints:
             tell_of(model, joints, train.pose)
             config = model.config
@@ -217,7 +217,7 @@ def pretrain(
 
 
 def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int) -> BasisDecoder:
-    """The folder's basis, made if it isn't there."""
+    """The folder's basis, made if there is none."""
     if (folder / "basis.json").exists():
         return load_basis(folder, opened.garment, expect=opened.identity)[0]
     displacement = opened.samples.displacement
@@ -230,9 +230,9 @@ def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int
 
 
 def bring_basis(source: Path, target: Path, *, written: str) -> None:
-    """Copies the output basis beside the weights that will be `written` there and need it.
+    """Copies the output basis from `source` to `target`, where the weights that will be `written` need it.
 
-    Raises `WeightsError` where other weights need the one that is there, and where it can't be copied.
+    Raises `WeightsError` where other weights in `target` need the basis there, and where it can't be copied.
     """
     if not is_writer() or not (source / "basis.json").exists():
         return
@@ -253,7 +253,7 @@ def bring_basis(source: Path, target: Path, *, written: str) -> None:
 
 
 def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:
-    """(β, γ) of a set's pivots, its first `n_pivots` pairs, shape (K, 14); of as many others where it has none."""
+    """(β, γ) of a set's pivots, its first `n_pivots` pairs, shape (K, 14); of as many other pairs if it has none."""
     pairs = [k for k in torch.unique(samples.pair).tolist() if k < n_pivots]
     pairs = pairs or torch.unique(samples.pair)[:n_pivots].tolist()
     return torch.stack([samples.style_shape[samples.pair == k][0] for k in pairs])
@@ -268,7 +268,7 @@ def stages(
     *,
     goes_on: bool = False,
 ) -> list[TrainingStage]:
-    """What is trained in which order; of a network that `goes_on` the last stage alone."""
+    """The stages to train, in order; for a network that `goes_on`, the last one alone."""
     if isinstance(model, Gcnn):
         if not goes_on:
             mean = train.displacement.mean(0)
@@ -303,16 +303,16 @@ def stages(
         return [*found, together]
     fine = []
     for (x, s, code), low_code in zip(both, coarse, strict=True):
-        own = (s[:, None] == model.pivots).all(-1)  # (N, K): whose sample it is
+        own = (s[:, None] == model.pivots).all(-1)  # (N, K): which pivot each sample belongs to
         kept = own.any(1)
         fine.append((x[kept], own[kept].float(), (code - low_code)[kept]))
     return [*found, TrainingStage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
 
 
 def tell_of(model: Network, joints: Sequence[int], pose: Tensor) -> None:
-    """Makes a network see further joints, which say nothing at first, in the range that poses (N, 24, 3) [rad] have.
+    """Makes a network see further joints, without effect at first, in the range of the poses (N, 24, 3) [rad].
 
-    Raises `RefuError` for joints that it sees already or that there aren't, and for a network of rotation vectors.
+    Raises `RefuError` for joints that it sees already or that don't exist, and for a network of rotation vectors.
     """
     config, before = model.config, model.features.size
     others = [joint for joint in range(1, N_JOINTS) if joint not in config.joints]
@@ -339,7 +339,7 @@ def _of_pose(model: Network) -> tuple[Perceptron | StackedPerceptrons, ...]:
 
 
 def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate, *, widen: bool) -> None:
-    """Standardises a network's inputs by those of the samples; of a trained one, only widens the range that it sees."""
+    """Standardises a network's inputs by the samples; to `widen` a trained one, only extends the range that it sees."""
     x, s = model.features(train.pose), train.style_shape
     seen = [(net, x if net is getattr(model, "high", None) else torch.cat((x, s), 1)) for net in _of_pose(model)]
     seen += [(model.style_shape, s)] if isinstance(model, TailorNet) else []
@@ -355,11 +355,11 @@ def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate
 
 
 class CodeLoss:
-    """Distance of garments [mm].
+    """Distance between garments [mm].
 
-    Dense codes are vertices: L1, as the original. In an orthonormal basis, distances between codes are root mean square
-    distances of vertices; trained on those instead of on L1 of vertices, networks are as good in a quarter
-    of the time.
+    Dense codes are vertices: L1, as in the original. In an orthonormal basis, distances between codes give root mean
+    square distances of vertices; networks trained on these instead of on the L1 of vertices are as good in a quarter of
+    the time.
     """
 
     def __init__(self, model: TailorNet | Mlp) -> None:
@@ -380,7 +380,7 @@ def _vertex_loss(predicted: Tensor, target: Tensor) -> Tensor:
 def low_frequency_code(
     model: TailorNet, smooth: LaplacianSmoothing, garment: GarmentTemplate, samples: TrainingSamples
 ) -> Tensor:
-    """Code of D_LF, shape (N, C): the garment smoothed, less its template (Patel et al. 2020)."""
+    """Code of D_LF, shape (N, C): the smoothed garment minus its template (Patel et al. 2020)."""
     decoder = model.decoder
     if isinstance(decoder, BasisDecoder):
         smoothed = smooth.transposed(decoder.components)

@@ -1,4 +1,4 @@
-"""How a training goes: a bar, a line a check, and a picture of the loss curves."""
+"""Progress of a training: a bar, a line of figures per check, and a picture of the loss curves."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class TrainingLog:
     def __init__(self, folder: Path, *, name: str, quiet: bool = False, is_writer: bool = True) -> None:
         """Writes `folder`/`name`.jsonl and `folder`/`name`.png; what an earlier run wrote is continued.
 
-        Of the processes of a parallel training one `is_writer`; the others say nothing.
+        Of the processes of a parallel training one `is_writer`; the others write and show nothing.
         """
         self._lines = folder / f"{name}.jsonl"
         self.picture = folder / f"{name}.png"
@@ -29,7 +29,7 @@ class TrainingLog:
         self._entries = _entries(self._lines)
 
     def begin(self, stage: str, *, step: int, steps: int) -> None:
-        """A stage of `steps` steps goes on at `step`; entries after it are of an interrupted run and dropped."""
+        """A stage of `steps` steps goes on at `step`; later entries are from an interrupted run and are dropped."""
         self._entries = [e for e in self._entries if e["stage"] != stage or e["step"] <= step]
         if self._is_shown:
             from tqdm import tqdm
@@ -42,11 +42,11 @@ class TrainingLog:
             self._bar.update(done - self._bar.n)
 
     def check(self, stage: str, step: int, **values: float) -> None:
-        """Losses at a step, by name [mm]."""
+        """Records losses at a step, by name [mm]."""
         if not self._is_writer:
             return
         self._entries.append({"stage": stage, "step": step, **{k: round(v, 5) for k, v in values.items()}})
-        # Under another name first: a training that is killed leaves the curves of the check before, and no half line.
+        # Under another name first: a training that is killed leaves the previous check's curves, and no half line.
         with replacing(self._lines) as file:
             file.write("".join(json.dumps(entry) + "\n" for entry in self._entries).encode())
         if self._bar is not None:
@@ -60,7 +60,7 @@ class TrainingLog:
         self.draw()
 
     def draw(self) -> None:
-        """Draws all curves so far, a panel a stage."""
+        """Draws all curves so far, one panel per stage."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -84,7 +84,7 @@ class TrainingLog:
 
 
 def _entries(path: Path) -> list[dict[str, Any]]:
-    """The entries of an earlier run; a log is no reason not to go on, so what isn't one is left out."""
+    """The entries of an earlier run; a damaged log is no reason to stop, so invalid lines are left out."""
     entries = []
     try:
         lines = read_file(path, most=MAX_JSON_BYTES, error=RefuError, wanted="the log of a training").splitlines()

@@ -1,4 +1,4 @@
-"""What a trained network is asked for again while it learns from new samples, lest it forget what it knew."""
+"""What a trained network rehearses while it learns from new samples, so that it doesn't forget what it knew."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from refu_core.training._data import TrainingSamples, in_chunks
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Bodies of the plans that a network was trained on, with what it predicts on them in place of the truth.
+    """Bodies of the plans that a network was trained on, with the network's predictions in place of the truth.
 
-    Their samples aren't needed: a plan says pose, shape and style of each.
+    The simulated samples aren't needed: a plan says the pose, shape and style of each.
     """
 
     count: int
@@ -31,12 +31,12 @@ class Rehearsal:
     def of(
         self, card: Mapping[str, Any], network: Network, *, known: Mapping[str, Any] | None = None
     ) -> TrainingSamples:
-        """Of a trained `network` and the card of its weights; of as many bodies as its plans have at most.
+        """The samples for a trained `network` and the card of its weights; at most as many as its plans have.
 
-        The plan whose truth is `known`, that of the new samples, is left out.
+        The plan `known`, that of the new samples, is left out, since its truth is there.
 
-        Raises `RefuError` for a card without a plan of its garment, and `SimulationError` for a plan that is none or
-        motions that aren't there.
+        Raises `RefuError` for a card without a plan of its garment, and `SimulationError` for an invalid plan or
+        missing motions.
         """
         names = {field.name for field in fields(SamplePlan)}
         given = plans_of(card, known=known)
@@ -65,7 +65,7 @@ class Rehearsal:
 
 
 def plans_of(card: Mapping[str, Any], *, known: Mapping[str, Any] | None = None) -> list[Mapping[str, Any]]:
-    """The plans that weights were trained on, by their card, but for `known`: those rehearsed, then their set's."""
+    """The plans that weights were trained on, by their card, except `known`: the rehearsed ones, then their set's."""
     rehearsed, dataset = card.get("rehearsed"), card.get("dataset")
     earlier = rehearsed.get("plans") if isinstance(rehearsed, Mapping) else None
     last = dataset.get("plan") if isinstance(dataset, Mapping) else None

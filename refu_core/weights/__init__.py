@@ -1,4 +1,4 @@
-"""Trained weights: safetensors beside a JSON card; and those that ship, a folder a garment."""
+"""Trained weights: safetensors beside a JSON card; and the weights that ship, one folder per garment."""
 
 from refu_core.weights._config import build_for as build_for
 from refu_core.weights._config import config_of_card as config_of_card

@@ -1,4 +1,4 @@
-"""What a card says of a network, turned into the network: nothing is built that the tensors beside it don't fit."""
+"""Builds the network that a card describes: nothing is built that the tensors beside the card don't fit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _LARGEST = 1 << 20
 _LONGEST = 64
 _WRONG = (KeyError, TypeError, ValueError, AttributeError, LookupError, ArithmeticError, RuntimeError, RefuError)
-"""What constructors raise on sizes that make no network."""
+"""What constructors raise for sizes that no network can have."""
 
 Config = TypeVar("Config", bound="DataclassInstance")
 Module = TypeVar("Module", bound=nn.Module)
@@ -46,14 +46,14 @@ def config_of_card(kind: type[Config], values: Any) -> Config:
 
 
 def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, shared: str = " ") -> Module:
-    """What `build` makes, with `tensors` in it; names that begin with `shared` stay as `build` makes them.
+    """What `build` makes, loaded with `tensors`; those whose names begin with `shared` stay as `build` makes them.
 
-    It is first made without memory: a card may claim sizes that no machine has, and its tensors give it away. Raises
-    `WeightsError` where the module can't be built, or has other tensors.
+    It is first built without memory: a card may claim sizes that no machine can hold, and its tensors reveal that.
+    Raises `WeightsError` where the module can't be built, or has other tensors.
     """
     try:
         with torch.device("meta"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of layers without a width, which don't fit any tensor
+            warnings.simplefilter("ignore")  # about layers of no width, which don't fit any tensor
             wanted = {k: v.shape for k, v in build().state_dict().items() if not k.startswith(shared)}
         got = {k: v.shape for k, v in tensors.items()}
         if wanted != got:
@@ -70,7 +70,7 @@ def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, sha
 
 
 def _fits(field: Field[Any], value: Any) -> bool:
-    """Whether a value is of the type of a field's default (a row of whole numbers, where it has none) and size."""
+    """Whether a value has the type of a field's default (a row of whole numbers, if it has none) and a valid size."""
     default = (0,) if field.default is MISSING else field.default
     if isinstance(default, bool) or isinstance(value, bool):
         return isinstance(default, bool) and isinstance(value, bool)

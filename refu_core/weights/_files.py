@@ -1,8 +1,8 @@
-"""Reading and writing of weights: what they are is checked before what they say is used.
+"""Reads and writes weights; files are checked before their content is used.
 
 Weights may be stored as differences from others in the same folder, their base. A difference is a whole number of
-steps, -127 to 127, in one byte: a tenth of the weights in 8 bits is as exact as all of them in half precision. A tensor
-that isn't stored at all is the base's.
+steps, -127 to 127, in one byte: differences a tenth as large as the weights are as exact in 8 bits as the weights are
+in half precision. A tensor that isn't stored at all is the base's.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ MAX_BYTES = 3 << 30
 """A larger file is refused before it is read; networks of the paper's sizes take 2.5 GB."""
 MAX_CARD_BYTES = 1 << 20
 LARGEST = 1e4
-"""No weight is larger: those that ship are below 30, and what overflowed in training is far above."""
+"""Larger weights are refused: those that ship are below 30, and what overflowed in training is far above."""
 _DTYPES = {
     *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
     *(torch.int64, torch.int32, torch.int8, torch.bool),
 }
 _PIECE = 1 << 22
 _STEP = ".step"
-"""After a tensor's name: how much a step of its difference is, a number."""
+"""Follows a tensor's name in the name of another one: the size of one step of its difference, a number."""
 _STEPS = 127
 
 
@@ -53,11 +53,11 @@ class Weights:
     path: Path
     """File of the tensors."""
     files: tuple[Path, ...]
-    """All files of tensors that were read: its own, and before it that of its base."""
+    """All files of tensors that were read: that of the base, if there is one, and then its own."""
 
 
 def weights_folder(garment: str, root: str | os.PathLike[str] | None = None) -> Path:
-    """The folder of a garment's weights below `root`, or of those that ship; it needs not exist."""
+    """The folder of a garment's weights below `root`, or of those that ship; it needn't exist."""
     require_type(root, (str, os.PathLike, NoneType), "a folder of weights", error=WeightsError)
     return (Path(__file__).parent if root is None else Path(root)) / garment
 
@@ -67,8 +67,8 @@ def save_weights(
 ) -> Path:
     """Writes `stem`.safetensors, which is returned, and its card `stem`.json; neither is ever left half written.
 
-    `base` is the name of weights in the same folder, stored whole, that these are stored as differences from. What it
-    has and `tensors` hasn't is read as the base's. Raises `WeightsError` where a tensor isn't finite, the base can't be
+    `base` is the name of weights in the same folder, stored whole, that these are stored as differences from. Tensors
+    that only the base has are read as the base's. Raises `WeightsError` where a tensor isn't finite, the base can't be
     read, or the disk can't be written.
     """
     stem = Path(stem)
@@ -149,7 +149,7 @@ def _require_sense(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def _differences(tensors: Mapping[str, Tensor], base: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What is stored of `tensors`; those that the base hasn't, or in another shape, are stored whole."""
+    """What is stored of `tensors`; those that the base lacks, or has in another shape, are stored whole."""
     stored = {}
     for name, tensor in tensors.items():
         if name not in base or base[name].shape != tensor.shape:
@@ -178,7 +178,7 @@ def _sum(base: Weights, stored: Weights) -> dict[str, Tensor]:
 
 
 def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
-    """The tensors of a file; none is made before the hash is known to be right."""
+    """The tensors of a file; none is made before the hash has been verified."""
     damaged = f"{path}: damaged, or not the file that its card describes"
     try:
         with _open(path, MAX_BYTES) as file:
@@ -208,7 +208,7 @@ def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
 
 
 def load_card(stem: str | Path) -> dict[str, Any]:
-    """The card of weights alone. Raises `WeightsError` where there is none, or it is no card of weights."""
+    """Reads only the card of weights. Raises `WeightsError` where there is none, or it isn't a card of weights."""
     path = Path(f"{stem}.json")
     try:
         with _open(path, MAX_CARD_BYTES) as file:

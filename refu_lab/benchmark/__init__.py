@@ -1,4 +1,4 @@
-"""What `refu benchmark` does: run time against error of every mode and signed distance, side by side in one run."""
+"""What `refu benchmark` does: measures run time and error of every mode and signed distance side by side in one run."""
 
 from refu_lab.benchmark._benchmark import benchmark as benchmark
 from refu_lab.benchmark._measure import Timing as Timing

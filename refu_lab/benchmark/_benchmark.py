@@ -73,7 +73,7 @@ def _measure(options: BenchmarkOptions, result: BenchmarkResult, progress: Calla
 
 
 def machine_facts(device: str) -> dict[str, Any]:
-    """Processor, cores, device and versions: plain values, ready for JSON."""
+    """Processor, cores, device and versions as plain values, ready for JSON."""
     facts: dict[str, Any] = {
         "processor": _processor(),
         "cores": os.cpu_count(),
@@ -95,10 +95,10 @@ def _processor() -> str:
 def accuracies(
     pipelines: Mapping[Key, GarmentPipeline], garment: str, bags: Path, *, frames: int | None
 ) -> dict[Key, dict[str, float]]:
-    """MPVE [mm], VFCP and CFMP [%] and the greatest depth [mm] of each pipeline in up to `frames` frames.
+    """MPVE [mm], VFCP and CFMP [%] and the largest depth [mm] of each pipeline over up to `frames` frames.
 
-    They are those of the bag of unseen bodies with the true garment, `eval_<garment>`; empty where there is none.
-    Raises `RefuError` where it can't be read.
+    The frames are those of `eval_<garment>`, a bag of unseen bodies with the true garment; empty without such a bag.
+    Raises `RefuError` if it can't be read.
     """
     bag = bags / f"eval_{garment.replace('-', '_')}"
     if not bag.is_dir():

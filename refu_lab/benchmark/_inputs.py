@@ -1,4 +1,4 @@
-"""What the contenders are given: stretches of recorded motion at 30 Hz, as a message's bytes and as posed meshes."""
+"""Input of the contenders: stretches of recorded motion at 30 Hz, as message bytes and as posed meshes."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from refu_core.garments import GarmentTemplate
 from refu_lab.benchmark._sdfs import SdfFrame
 
 RATE = 30.0
-"""Frames a second of the motion that is measured."""
+"""Frame rate of the measured motion [Hz]."""
 _MOTION_BAGS = ("walk", "reach_squat")
 Stretch = Sequence[SmplFrame]
 
 
 @dataclass(frozen=True, eq=False)
 class EncodedFrame:
-    """One frame in every form that a contender may want."""
+    """One frame in every form that a contender may need."""
 
     frame: SmplFrame
     raw: bytes
-    """The message that comes in (`std_msgs/Float32MultiArray`)."""
+    """The input message (`std_msgs/Float32MultiArray`)."""
     sdf: SdfFrame
     """The body, and the garment before collisions are handled."""
     is_jump: bool
-    """Whether it doesn't follow the frame before it."""
+    """Whether it doesn't continue the frame before it."""
 
 
 Window = Sequence[EncodedFrame]
 
 
 def read_stretches(motions: Path | None, bags: Path, *, count: int, length: int) -> list[Stretch]:
-    """`count` stretches of `length` frames at 30 Hz, evenly from all the motion there is.
+    """`count` stretches of `length` frames at 30 Hz, evenly spread over all the motion there is.
 
     Raises:
-        RefuError: no motion there, or a file that can't be read.
+        RefuError: there is no motion of that length, or a file can't be read.
     """
     starts = [(clip, start) for clip in _clips(motions, bags) for start in range(0, len(clip) - length + 1, length)]
     if not starts:
@@ -64,7 +64,7 @@ def _clips(motions: Path | None, bags: Path) -> Iterator[Stretch]:
 
 
 def moments(stretches: Sequence[Stretch], pipeline: GarmentPipeline) -> list[Window]:
-    """The stretches with what the only garment of `pipeline` looks like in them before collisions are handled."""
+    """The stretches as windows, with the only garment of `pipeline` in each frame before collision handling."""
     ((name, garment),) = pipeline.garments.items()
     encode = adapters.encoder_for("multiarray")
     windows: list[Window] = []

@@ -1,4 +1,4 @@
-"""Times that can be compared: contenders in turn, in one process, on one core, by the processor's clock."""
+"""Comparable times: contenders take turns in one process on one core, measured in processor time."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class Timing:
     """How long one contender took, call by call."""
 
     cpu_ms: NDArray[np.float64]
-    """The processor's time of each call, all threads of the process together [ms], shape (n,)."""
+    """Processor time of each call, all threads of the process together [ms], shape (n,)."""
     wall_ms: NDArray[np.float64]
     """Wall time of each call [ms], shape (n,)."""
     on_gpu: bool = False
-    """Whether the work was done elsewhere, so that the wall clock alone tells."""
+    """Whether the work was done on a GPU, so that only wall time measures it."""
 
     @property
     def ms(self) -> NDArray[np.float64]:
-        """The times to compare [ms], shape (n,): of the processor, which other processes don't disturb."""
+        """The times to compare [ms], shape (n,): processor time undisturbed by other processes; on a GPU, wall time."""
         return self.wall_ms if self.on_gpu else self.cpu_ms
 
     @property
@@ -43,7 +43,7 @@ class Timing:
 
     @property
     def quartiles(self) -> tuple[float, float]:
-        """Lower and upper [ms]."""
+        """Lower and upper quartile [ms]."""
         low, high = np.percentile(self.ms, (25, 75))
         return float(low), float(high)
 
@@ -55,7 +55,7 @@ class Timing:
 
 @contextlib.contextmanager
 def one_core() -> Iterator[int]:
-    """One thread on one core; gives its number."""
+    """Keeps the block to one thread on one core; yields the core's number."""
     allowed = os.sched_getaffinity(0)
     core = max(allowed)
     os.sched_setaffinity(0, {core})
@@ -68,10 +68,10 @@ def one_core() -> Iterator[int]:
 
 @contextlib.contextmanager
 def processor_clock() -> Iterator[None]:
-    """Inside, whatever reads `time.perf_counter` gets the processor's time.
+    """Inside the block, `time.perf_counter` gives processor time.
 
-    A pipeline notes its stages by the wall clock, as its user wants to know them. On a machine that others use, too,
-    that says more about the others.
+    A pipeline measures its stages in wall time, which is what its user wants to know. On a shared machine that says
+    more about the other users.
     """
     clock = time.perf_counter
     vars(time)["perf_counter"] = time.process_time
@@ -93,18 +93,18 @@ def measure(
     """Times contenders on the same inputs, in turn, so that a machine that gets slower gets slower for all of them.
 
     Args:
-        contenders: What is timed, by name. Their order moves on by one with each window.
-        windows: Inputs that follow each other, two at least a window. The first of each is a jump for whoever
-            remembers the last one; it warms up and isn't counted.
-        rounds: How often every window is gone through.
-        slow: Contenders that get one input of the first two windows alone, in the first round.
+        contenders: What is timed, by name. Their order rotates by one with each window.
+        windows: Inputs in sequence, at least two a window. The first of a window is a jump for contenders that
+            remember the last input; it warms them up and isn't counted.
+        rounds: How often every window is run.
+        slow: Contenders that are timed on one input of each of the first two windows only, in the first round.
         on_gpu: Wait for the GPU before and after each call.
         progress: Called after every window of a contender.
     """
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in contenders}
     names = list(contenders)
     gc.collect()
-    gc.disable()  # the collector would strike some contender for what all have left
+    gc.disable()  # a collection would charge one contender for the garbage of all
     try:
         for turn in range(rounds * len(windows)):
             window = windows[turn % len(windows)]

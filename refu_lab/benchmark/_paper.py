@@ -1,4 +1,4 @@
-"""The paper's structure at the paper's sizes, drawn instead of trained: only what it costs is asked for."""
+"""The paper's structure at the paper's sizes, with random instead of trained weights: only its cost is measured."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class PaperSettings:
     """Sizes; the defaults are the paper's, anything less is for a trial run."""
 
     pivots: int = 20
-    """High-frequency networks of TailorNet."""
+    """Number of TailorNet's high-frequency networks."""
     width: int = 1024
-    """Of the layers of h and of the distance network."""
+    """Width of the layers of h and of the distance network."""
     dtype: torch.dtype = torch.float32
-    """Of the networks; bfloat16 and float16 are for GPUs."""
+    """Precision of the networks; bfloat16 and float16 are for GPUs."""
 
 
 class _LowPrecision(WithoutWearerCode):
@@ -58,7 +58,7 @@ class PaperStructure:
     """
 
     def __init__(self, garment: GarmentTemplate, body: SmplBody, *, settings: PaperSettings | None = None) -> None:
-        """For a garment on its body, on their device."""
+        """Builds it for a garment and its body, on the body's device."""
         settings = settings or PaperSettings()
         self._dtype = settings.dtype
         self._garment, self._body, device = garment, body, body.device
@@ -67,7 +67,7 @@ class PaperStructure:
             garment.to(device="cpu"),
             pivots=torch.randn(settings.pivots, N_BETAS + N_STYLES),
         )
-        # Of ReFU's networks h and g: k is evaluated for all vertices here, which is one product.
+        # Sizes of ReFU's networks h and g. Here k is one dense layer, evaluated for all vertices in one product.
         sizes = replace(PAPER, feature_size=settings.width, hidden_size=settings.width, is_compact=True)
         n = self._garment.n_vertices
         backbone = backbone.to(device, self._dtype).eval().requires_grad_(False)
@@ -80,17 +80,17 @@ class PaperStructure:
         self._scale = ScaleNet(n, least=0.0, settings=sizes).to(device, self._dtype).requires_grad_(False)
         self._k = nn.Linear(settings.width, n * PAPER.latent_size).to(device, self._dtype).requires_grad_(False)
         self.stages: list[dict[str, float]] = []
-        """What each stage took in each frame, by the clock that `time.perf_counter` is [ms]."""
+        """Time of each stage in each frame, by whichever clock `time.perf_counter` reads [ms]."""
 
     @property
     def n_parameters(self) -> int:
-        """How many weights were drawn."""
+        """Number of weights."""
         networks = (*self._networks, self._distance, self._scale, self._k)
         return sum(p.numel() for network in networks for p in network.parameters())
 
     @torch.no_grad()
     def __call__(self, frame: SmplFrame) -> NDArray[np.float32]:
-        """A garment of no meaning [m], shape (V, 3), by the paper's way."""
+        """A meaningless garment [m], shape (V, 3), computed the paper's way."""
         ended = {"start": time.perf_counter()}
         pose = torch.tensor(frame.pose, device=self._body.device)[None]
         betas = torch.tensor(frame.betas, device=self._body.device)[None]
@@ -109,7 +109,7 @@ class PaperStructure:
         return vertices
 
     def _sample(self, points: Tensor, betas: Tensor, pose: Tensor) -> SdfSample:
-        """Distance and, by backpropagation, gradient at all vertices."""
+        """The distance and, by backpropagation, its gradient at all vertices."""
         rotation, root = body_frame(self._body, pose, betas)
         own = (points - root[0]) @ rotation[0] + root[0]
         condition = (betas.to(self._dtype), pose[:, 1:].to(self._dtype))

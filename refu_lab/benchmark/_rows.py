@@ -16,12 +16,12 @@ class BenchmarkRow:
     stage: str
     """What was measured: `sdf`, `frame`, `frame.<stage>`, `persons`, `unchanged` or `start`."""
     mode: str
-    """The pipeline's, or `plain`, `paper` or `other`."""
+    """The pipeline's mode, or `plain`, `paper` or `other`."""
     garment: str
     ms_median: float
-    """The processor's time; on a GPU, wall time [ms]."""
+    """Median processor time; on a GPU, wall time [ms]."""
     ratio: float
-    """To refitting a BVH and asking it for all vertices of the garment, measured in turn with it."""
+    """Ratio of this time to that of the plain query (`PLAIN_QUERY`), measured in turn with it."""
     ms_q1: float | None = None
     ms_q3: float | None = None
     wall_ms_median: float | None = None
@@ -32,11 +32,11 @@ class BenchmarkRow:
     persons: int | None = None
     vertices: int | None = None
     figures: Mapping[str, float] = field(default_factory=dict)
-    """Whatever else belongs to it, by name with unit."""
+    """Further figures, by name with unit."""
 
     @classmethod
     def of(cls, timing: Timing, plain: Timing, **facts: Any) -> BenchmarkRow:
-        """A row of times, and of those of the plain query that were taken in turn with them."""
+        """A row from a timing, and from that of the plain query measured in turn with it."""
         low, high = timing.quartiles
         return cls(
             ms_median=timing.median,
@@ -56,17 +56,17 @@ class BenchmarkRow:
 
 @dataclass(eq=False)
 class BenchmarkResult:
-    """Everything that tables, plot and JSON need."""
+    """Everything that the tables, the plot and the JSON file need."""
 
     command: str
     quick: bool
     machine: dict[str, Any] = field(default_factory=dict)
     rows: list[BenchmarkRow] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
-    """What wasn't measured, and what it takes."""
+    """What wasn't measured, and what is needed to measure it."""
 
     def of(self, stage: str, **facts: Any) -> list[BenchmarkRow]:
-        """The rows of a stage in which these facts hold."""
+        """The rows of a stage whose fields have the values in `facts`."""
         return [
             row
             for row in self.rows

@@ -1,4 +1,4 @@
-"""Starts processes and says what they needed."""
+"""Starts processes and measures what they need."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from refu_lab.commands.benchmark import BenchmarkOptions
 def start_row(
     options: BenchmarkOptions, *, mode: str, backbone: str, unit_ms: float, first_ever: bool = False
 ) -> BenchmarkRow:
-    """A process that loads two garments and dresses one person: its seconds and its megabytes.
+    """Seconds and megabytes of a process that loads two garments and dresses one person.
 
-    `first_ever` has it compile its kernels, as on a machine where nothing has run yet; `unit_ms` is the plain query's.
-    Without weights of both garments the skinned template is worn.
+    `first_ever` makes it compile its kernels, as on a machine where nothing has run yet. `unit_ms` is the time of the
+    plain query. Unless both garments have weights, the skinned template is worn.
 
     Raises:
-        RefuError: it failed.
+        RefuError: the process failed.
     """
     sizes = _weights_mb(options, backbone, mode)
     backbone = backbone if len(sizes) == len(DEFAULT_GARMENTS) else "skinned"
@@ -65,7 +65,7 @@ def start_row(
 
 
 def _weights_mb(options: BenchmarkOptions, backbone: str, mode: str) -> dict[str, float]:
-    """Size on disk of each garment's basis and networks [MB], by name; of those that there are."""
+    """Size on disk of each garment's basis and networks [MB], by name, of the garments that have them."""
     sizes = {}
     for garment in DEFAULT_GARMENTS:
         folder = weights_folder(garment, options.weights)

@@ -1,4 +1,4 @@
-"""What a benchmark leaves behind: its rows as tables, for a terminal and for a page, JSON and a plot."""
+"""Output of a benchmark: its rows as tables (for a terminal and for a page), JSON and a plot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MODES = ("hybrid", "accurate")
 
 
 def tables(result: BenchmarkResult) -> list[TextTable]:
-    """All tables there are rows for."""
+    """All tables that have rows."""
     made = (frames, stages, sdfs, persons, unchanged, paper, starts)
     return [table for table in (make(result) for make in made) if table.rows]
 
@@ -50,14 +50,14 @@ def stages(result: BenchmarkResult) -> TextTable:
 
 
 def sdfs(result: BenchmarkResult) -> TextTable:
-    """Every way to the distances."""
+    """Run time of every signed distance."""
     rows = [(_where(row, f"{row.garment}: {row.method}"), *_times(row)) for row in result.of("sdf")]
     note = "Of all vertices of a body's new pose, preparation included. The plain query is the unit of all ratios."
     return TextTable("Every signed distance, of the same vertices", ("signed distance", *_TIMES), rows, note)
 
 
 def persons(result: BenchmarkResult) -> TextTable:
-    """Growth with persons."""
+    """How run time grows with the number of persons."""
     rows = [
         (_where(row, f"{row.mode}, {row.persons}"), *_times(row), _figure(row, "ratio_to_one_person", 2))
         for row in result.of("persons")
@@ -66,7 +66,7 @@ def persons(result: BenchmarkResult) -> TextTable:
 
 
 def unchanged(result: BenchmarkResult) -> TextTable:
-    """The same pose again."""
+    """Run time when the pose doesn't change."""
     rows = [
         (
             _where(row, row.mode),
@@ -146,7 +146,7 @@ PAGE, DATA = "performance.md", "performance.json"
 
 
 def write_results(result: BenchmarkResult, folder: Path) -> list[Path]:
-    """Writes `performance.md`, `performance.json` and, where errors were measured, the plot; gives their paths.
+    """Writes `performance.md`, `performance.json` and, if errors were measured, the plot; returns their paths.
 
     Raises:
         RefuError: the folder can't be written.
@@ -165,7 +165,7 @@ def write_results(result: BenchmarkResult, folder: Path) -> list[Path]:
 
 
 def conditions(result: BenchmarkResult) -> str:
-    """The machine, and what else it was doing."""
+    """The machine, its load, and how times were measured."""
     machine = result.machine
     text = f"{machine['processor']}, {machine['cores']} cores, one thread, pinned to core {machine['core']}; "
     text += f"torch {machine['torch']}"
@@ -194,12 +194,12 @@ _METRICS = (
 )
 _COLOURS = {"none": "#7a7a7a", "approx": "#e0a030", "hybrid": "#4a9a6a", "accurate": "#3b6ea5"}
 _SIZES = {"none": 7, "approx": 12, "hybrid": 8.5, "accurate": 5}
-"""Smaller ones are drawn later, so that places which are nearly the same can be told apart."""
+"""Marker sizes. Smaller ones are drawn later, so that points at nearly the same place can be told apart."""
 _MARKERS = {"tailornet": "o", "skinned": "s"}
 
 
 def plot_time_against_error(result: BenchmarkResult, folder: Path) -> Path | None:
-    """Writes `time-against-error.png` of the main garment; None where no errors were measured."""
+    """Writes `time-against-error.png` for the main garment; returns None if no errors were measured."""
     shown = [row for row in result.of("frame") if row.mode != "paper" and row.garment == result.rows[0].garment]
     shown = [row for row in shown if all(name in row.figures for name, _ in _METRICS)]
     if not shown:
@@ -247,7 +247,7 @@ def _style(row: BenchmarkRow) -> dict[str, Any]:
 
 
 def _marks(result: BenchmarkResult) -> list[tuple[float, str]]:
-    """Times that have no error of their own: the plain query's, and that of the untrained paper's structure."""
+    """Times without an error of their own: that of the plain query, and that of the paper's structure, untrained."""
     main = result.rows[0].garment
     marks = [(row.ms_median, "plain query alone") for row in result.of("sdf", mode="plain", garment=main, device="cpu")]
     if not result.quick:

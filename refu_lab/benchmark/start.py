@@ -1,7 +1,7 @@
-"""What a process of its own needs: time until its first garments, and memory.
+"""What a fresh process needs: time until its first garments, and memory.
 
-`refu benchmark` runs this file as a script, so that nothing is counted but what a user imports. It is given when it was
-started (Unix time) and, as JSON, what `GarmentPipeline.load` is; it prints a line of JSON.
+`refu benchmark` runs this file as a script, so that only what a user would import counts. Its arguments are the time it
+was started (Unix time) and, as JSON, the arguments of `GarmentPipeline.load`; it prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import time
 from pathlib import Path
 
 FRAMES = 30
-"""Frames after the first, until memory is looked at."""
+"""Frames after the first, before memory is measured."""
 
 
 def memory_mb() -> tuple[float, float]:
-    """Resident memory of this process, now and at most [MB]."""
+    """Resident memory of this process, current and peak [MB]."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     fields = dict(line.split(":", 1) for line in lines if ":" in line)
     now, peak = (float(fields[key].split()[0]) * 1024e-6 for key in ("VmRSS", "VmHWM"))
@@ -24,7 +24,7 @@ def memory_mb() -> tuple[float, float]:
 
 
 def main() -> None:
-    """Loads, dresses one body, and goes on for a while."""
+    """Loads a pipeline, dresses one body, and goes on for some frames."""
     started, asked = float(sys.argv[1]), json.loads(sys.argv[2])
 
     import numpy as np

@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkSizes:
-    """How much is measured; the defaults are those of a run whose figures are kept."""
+    """How much is measured; the defaults are those of a full run, whose figures are kept."""
 
     rounds: int
     windows: int = 8
-    """Stretches of motion."""
+    """Number of stretches of motion."""
     frames: int = 9
-    """Frames of a stretch, at 30 Hz, the first of which isn't counted."""
+    """Frames in a stretch, at 30 Hz; the first isn't counted."""
     persons: tuple[int, ...] = (1, 2, 4, 8)
     test_frames: int | None = None
-    """Frames with ground truth of a garment; None for all there are."""
+    """Most frames with ground truth for each garment; None for all."""
     has_network: bool = True
     """Whether the paper's networks are measured at the paper's sizes."""
     modes: tuple[str, ...] = ("none", "approx", "hybrid", "accurate")
     starts: tuple[str, ...] = ("hybrid", "accurate")
-    """Modes of which a process of its own is started."""
+    """Modes whose start is measured in a new process."""
 
 
 _QUICK = BenchmarkSizes(
@@ -72,7 +72,7 @@ class BenchmarkOptions:
     device: str | None = setting(None, "cpu, or cuda for both (default: cuda where there is one)")
 
     def __post_init__(self) -> None:
-        """Raises `RefuError` for options of which nothing can be measured."""
+        """Raises `RefuError` for options with which nothing can be measured."""
         unknown = [name for name in self.garments or () if name not in PAPER_GARMENTS]
         if unknown:
             msg = f"no garment {unknown[0]!r}: wanted some of {', '.join(PAPER_GARMENTS)}"
@@ -94,7 +94,7 @@ class BenchmarkOptions:
 
     @property
     def devices(self) -> tuple[str, ...]:
-        """Where frames are computed, the CPU first."""
+        """Devices that compute frames, the CPU first."""
         import torch
 
         from refu_core._device import checked_device
@@ -108,7 +108,7 @@ class BenchmarkOptions:
         return _QUICK if self.quick else BenchmarkSizes(rounds=self.rounds)
 
     def on_body(self, garment: str, *, device: str = "cpu") -> tuple[GarmentTemplate, SmplBody]:
-        """A garment, and who wears it. Raises `RefuError` where there is no such body."""
+        """A garment and the body that wears it. Raises `RefuError` if there is no such body."""
         from refu_core.body import load_fit
         from refu_core.garments import load_garment, worn_on
 
@@ -119,7 +119,7 @@ class BenchmarkOptions:
     def load_pipeline(
         self, garment: str, *, mode: str, backbone: str, device: str, graph: bool = True
     ) -> GarmentPipeline:
-        """A pipeline of one garment. Raises `WeightsError` where there are no weights of the backbone for it."""
+        """A pipeline with one garment. Raises `WeightsError` if the backbone has no weights for it."""
         from refu_core import GarmentPipeline
 
         return GarmentPipeline.load(
@@ -135,7 +135,7 @@ class BenchmarkOptions:
 
     @property
     def command(self) -> str:
-        """The command that measures the same again, with the names of folders alone."""
+        """The command that measures the same again, with folder names in place of full paths."""
         parts = ["refu benchmark"]
         parts += [f"--garments {','.join(self.garments)}"] if self.garments is not None else []
         parts += [f"--motions {self.motions.resolve().name}/"] if self.motions is not None else []

@@ -1,4 +1,4 @@
-"""`refu evaluate`: the paper's tables and figures on own data."""
+"""`refu evaluate`: makes the paper's tables and figures on your own data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`refu export`: dressed persons as meshes for other programs."""
+"""`refu export`: writes dressed persons as meshes for other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`refu garment`: garments of one's own."""
+"""`refu garment`: adds your own garments and lists all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from refu_lab.commands import _common as cli
 
 @dataclass(frozen=True, kw_only=True)
 class AddOptions:
-    """What is made of which mesh."""
+    """Which mesh to make a garment from, and how."""
 
     mesh: Path
     body: str = setting("neutral", "male, female or neutral")

@@ -1,4 +1,4 @@
-"""`refu info`: what is installed, built in and usable."""
+"""`refu info`: shows what is installed, built in and usable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`refu replay`: recorded motion through the pipeline, measured."""
+"""`refu replay`: runs recorded motion through the pipeline and measures it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingOptions(DressOptions):
-    """A recording, how it is read, and how who is in it is dressed."""
+    """A recording, how it is read, and how the person in it is dressed."""
 
     input: Path
     topic: str | None = setting(None, "input topic, where a bag has several with SMPL parameters", metavar="NAME")
@@ -36,11 +36,11 @@ class RecordingOptions(DressOptions):
 
     @property
     def axes(self) -> InputAxes:
-        """What the frames' roots, and so the garments, are expressed in."""
+        """The axes that the frames' roots, and so the garments, are in."""
         return "frame" if self.input_axes == "frame" or self.input_type in KEYPOINT_TYPES else "smpl"
 
     def load_pipeline(self) -> GarmentPipeline:
-        """The pipeline that these options ask for. Raises `RefuError` for options that make none."""
+        """The pipeline that these options ask for. Raises `RefuError` for invalid options."""
         return self.load(margin=self.margin, style=self.style if any(self.style) else None)
 
 
@@ -57,7 +57,7 @@ class ReplayOptions(RecordingOptions):
     overwrite: bool = setting(False, "replace an existing output")
     evaluate: bool = setting(True, "check every frame for collisions; if not, only its latency is kept")
     with_body: bool = True
-    """Whether the output carries the body, too."""
+    """Whether the output also has the body."""
 
 
 def add(commands: Any) -> None:

@@ -1,4 +1,4 @@
-"""`refu simulate`: data sets of simulated garments."""
+"""`refu simulate`: makes data sets of simulated garments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from refu_lab.commands import _common as cli
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """What is simulated."""
+    """What to simulate."""
 
     garments: list[str]
     count: int

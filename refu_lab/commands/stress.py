@@ -1,4 +1,4 @@
-"""`refu stress`: attempts to break the pipeline."""
+"""`refu stress`: tries to break the pipeline."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from refu_lab.commands import _common as cli
 
 PARTS = ("numbers", "guarantees", "invariance", "soak")
 MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "accurate"), ("tailornet", "hybrid"))
-"""Backbone and signed distance of the modes that are tried if none is named."""
+"""Backbone and signed distance of the modes that are tried by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,12 +57,12 @@ class StressOptions:
 
     @property
     def n_rounds(self) -> int:
-        """How often each check has its turn, at least."""
+        """How often each check is run, at least."""
         return self.rounds or (1 if self.quick or self.hours is not None else 3)
 
     @property
     def n_frames(self) -> int:
-        """Of each soak, at most."""
+        """Frames of each soak, at most."""
         return self.frames or (10_000_000 if self.hours is not None else 200 if self.quick else 3_000)
 
 

@@ -1,4 +1,4 @@
-"""`refu train`: a garment's networks from a data set."""
+"""`refu train`: trains a garment's networks on a data set."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TRAIN_MODES = ("none", "hybrid", "approx", "accurate", "collision-approx", "coll
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What is trained on what."""
+    """What to train, and on what."""
 
     garment: str
     data: Path
@@ -81,7 +81,7 @@ class TrainOptions:
 
     @property
     def folder(self) -> Path:
-        """Where the weights are: in weights/, `GarmentPipeline.load(weights="weights")` finds them."""
+        """Where the weights go; `GarmentPipeline.load(weights="weights")` finds those in weights/."""
         from refu_core import load_garment
 
         return Path("weights") / load_garment(self.garment).name if self.output is None else self.output

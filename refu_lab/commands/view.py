@@ -1,4 +1,4 @@
-"""`refu view`: recorded motion, dressed, or a node that runs, in the browser."""
+"""`refu view`: shows recorded motion, dressed, or a running node in the browser."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class ViewOptions:
 
     inputs: tuple[Path, ...] = ()
     live: tuple[str, ...] | None = None
-    """Topics of markers to look at, in place of inputs: none for the node's own; None: no topics, the inputs."""
+    """Marker topics to show in place of inputs; if empty, the node's own; None shows the inputs."""
     dressing: RecordingOptions
-    """How motion is dressed; its input is left out of account."""
+    """How motion is dressed; its `input` is ignored."""
     dress: bool = setting(False, "dress the motion again, even if the bag has garments")
     host: str = setting("localhost", "address to listen on; 0.0.0.0: all", metavar="NAME")
     port: int | None = setting(

@@ -1,6 +1,6 @@
-"""Many inputs, many processes, many machines: what is found, who does it, where it is kept, what it comes to.
+"""Many inputs on many processes or machines: finding the inputs, running the tasks, storing and summing up results.
 
-A scheduler and workers import this package for what runs there: what needs torch is in `refu_lab.fleet.replay`.
+A scheduler and workers import this package for what runs there, so whatever needs torch is in `refu_lab.fleet.replay`.
 """
 
 from refu_lab.fleet._engine import FleetError as FleetError

@@ -1,7 +1,7 @@
 """Dask as the engine: processes of this machine, or the workers of a scheduler, wherever they are.
 
-Dask is imported by who asks for more than one process. A task that is lost with its worker is given to another one, and
-gives the same there: its result is a function of its content.
+Dask is imported only if more than one process is asked for. A task that is lost with its worker is given to another
+one and gives the same result there, which depends only on the task's content.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 IN_FLIGHT = 4
-"""Tasks that a process has waiting: enough that it never waits itself, few enough that results don't pile up."""
+"""Tasks submitted at a time for each process: enough that it never idles, few enough that results don't pile up."""
 CONNECT_S = 20.0
-"""How long a scheduler is looked for [s]."""
+"""How long to try to reach a scheduler [s]."""
 ALLOWED_FAILURES = 5
-"""Workers that may die with a task before it is given up: a task that takes all memory ends each worker that tries."""
+"""Workers that may die before a task is given up: a task that takes all memory kills each worker that tries it."""
 
 
 class FleetError(RefuError):
-    """Workers that can't be had, or can't be reached any more."""
+    """Workers can't be started, or can't be reached any more."""
 
 
 @contextmanager
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """The engine for `jobs` processes of this machine (None or 1: this one alone), or for a Dask scheduler's address.
+    """The engine for `jobs` processes on this machine (None or 1: this one alone), or for a Dask scheduler's address.
 
     Raises:
         FleetError: Dask isn't installed, both were asked for, or there is no scheduler at the address.
@@ -62,7 +62,7 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.admin.log-format": "%(message)s",
     }
-    # What goes wrong is said in one line by who gave the command; a scheduler that is gone would be a traceback.
+    # Errors are reported in one line by the command; Dask would log a traceback for a scheduler that is gone.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with dask.config.set(settings), ExitStack() as stack:
@@ -77,20 +77,20 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
 
 @contextmanager
 def _own_cluster(jobs: int | None) -> Iterator[Any]:
-    """Processes of this machine, which end with the block.
+    """Processes on this machine, which end with the block.
 
-    Ctrl-C is for this process alone, which ends them: they, and whoever takes their place, inherit that it's blocked.
-    While they start and end it has to wait.
+    Only this process handles Ctrl-C, and then ends the others: they and their replacements inherit that it's blocked.
+    While they start and end, it is held back here, too.
     """
     from distributed import LocalCluster
 
-    resource_tracker.ensure_running()  # else the first process to be started would start it, and unblock Ctrl-C
+    resource_tracker.ensure_running()  # else the first process would start it, which unblocks Ctrl-C
     with _ctrl_c_waits():
         cluster: Any = LocalCluster(
             n_workers=jobs,
             threads_per_worker=1,
             processes=True,
-            dashboard_address="127.0.0.1:0",  # of bokeh, or (without it) a few pages of text
+            dashboard_address="127.0.0.1:0",  # drawn by bokeh, or without it a few pages of text
             silence_logs=logging.CRITICAL,
         )
     try:
@@ -114,7 +114,7 @@ class DaskEngine:
 
     def __init__(self, client: Client) -> None:
         self.client = client
-        """Whose workers run them."""
+        """The client whose workers run the tasks."""
 
     def run(
         self, make: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task]
@@ -124,13 +124,13 @@ class DaskEngine:
 
         packed = pickle.dumps(make)
         digest = hashlib.sha256(packed).hexdigest()[:16]
-        # A task like any other: whoever loses it gets it again, where scattered data would be gone with its worker.
+        # A task like any other: it is run again if its worker dies, whereas scattered data would be lost.
         shared = self.client.submit(bytes, packed, key=f"refu-make-{digest}", pure=False)
         numbers: dict[Future[Any], int] = {}
         folder = os.getcwd()  # noqa: PTH109
 
         def submit(index: int) -> Future[Any]:
-            # Packed: a scheduler reads what it passes on, and would import torch for it.
+            # Packed: a scheduler unpickles what it passes on, and would have to import torch.
             task = pickle.dumps(tasks[index])
             key = f"refu-task-{digest}-{index}-{hashlib.sha256(task).hexdigest()[:16]}"
             future = self.client.submit(_work, shared, digest, task, __version__, folder, key=key, pure=False)
@@ -154,7 +154,7 @@ class DaskEngine:
         from distributed.comm import CommClosedError
 
         try:
-            return future.result()  # where that was on a worker that has died since, the task is done again
+            return future.result()  # if its worker has died since, the task is run again
         except (CancelledError, CommClosedError) as error:
             msg = "the Dask scheduler is gone; what is finished is kept: give the same command again to go on"
             raise FleetError(msg) from error
@@ -166,13 +166,13 @@ class DaskEngine:
 
 
 _made: dict[str, Callable[[Any], Any]] = {}
-"""This process's function, by what it was made of; the last one alone, as it may hold networks."""
+"""This process's function by the digest of its maker; only the last one, as it may hold networks."""
 
 
 def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) -> Any:
-    """On a worker: makes the function, unless it has it, and calls it where the command was given.
+    """Runs on a worker: makes the function unless it has it, and calls it in the command's working folder.
 
-    A relative path is the command's then, wherever the disk is the same.
+    So relative paths mean the same as for the command, wherever the disk is shared.
     """
     with contextlib.suppress(OSError):
         os.chdir(folder)
@@ -182,16 +182,16 @@ def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) ->
     if digest not in _made:
         _made.clear()
         make = pickle.loads(packed)
-        if "torch" in sys.modules:  # it takes seconds to import; what needs it has done so by now
+        if "torch" in sys.modules:  # importing it takes seconds; if it's needed, it's imported by now
             import torch
 
-            torch.set_num_threads(1)  # processes are the parallelism, whoever started the worker
+            torch.set_num_threads(1)  # parallelism is by processes, however the worker was started
         _made[digest] = make()
     return _made[digest](pickle.loads(task))
 
 
 def run_function(function: Callable[[Task], Result]) -> Callable[[], Callable[[Task], Result]]:
-    """`make` of an engine for a function that needs nothing made."""
+    """The argument `make` of an engine, for a function that needs no preparation."""
     return partial(_itself, function)
 
 

@@ -1,4 +1,4 @@
-"""Recordings by file, folder, glob and URL."""
+"""Finds recordings by file, folder, glob and URL."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from refu_core.recordings import SUFFIXES as MOTION_SUFFIXES
 from refu_lab.fleet._storage import filesystem, is_url
 
 SUFFIXES = (*BAG_SUFFIXES, *MOTION_SUFFIXES)
-"""Of recordings that a folder is searched for."""
+"""Suffixes of the recordings that a folder is searched for."""
 _METADATA = "metadata.yaml"
 _MAGIC = re.compile(r"[*?\[]")
 _SPLIT = re.compile(r"(.+)_\d+")
@@ -30,11 +30,11 @@ class Input:
     source: str
     """A path or a URL."""
     name: str
-    """What its results are called: a relative path without a suffix, with slashes; no other one has it."""
+    """Unique name of its results: a relative path with slashes, without a suffix unless names would be equal."""
 
 
 def is_plain(inputs: Sequence[str]) -> bool:
-    """Whether this is one recording on this machine, named as it is."""
+    """Whether this is the plain path of a single recording on this machine."""
     if len(inputs) != 1 or is_url(inputs[0]):
         return False
     path = Path(inputs[0])
@@ -46,10 +46,10 @@ def is_plain(inputs: Sequence[str]) -> bool:
 def find_recordings(inputs: Sequence[str], *, results: Sequence[str | None] = ()) -> list[Input]:
     """The recordings that paths, folders, globs (with **) and URLs stand for, each once, sorted within each of them.
 
-    A folder with `metadata.yaml`, or with files FOLDER_0, FOLDER_1, … alone, is one rosbag2 bag; any other is searched.
-    What is in the folders or URLs of `results` is left out.
+    A folder with `metadata.yaml`, or whose recordings are all called FOLDER_0, FOLDER_1, …, is one rosbag2 bag; any
+    other is searched. Whatever is in the folders or URLs of `results` is left out.
 
-    Raises `RefuError` where one stands for nothing.
+    Raises `RefuError` if one of `inputs` stands for nothing.
     """
     sources: dict[str, None] = {}
     written = tuple(f"{_whole(place)}/" for place in results if place is not None)
@@ -64,7 +64,7 @@ def find_recordings(inputs: Sequence[str], *, results: Sequence[str | None] = ()
 
 
 def find_data_sets(inputs: Sequence[str]) -> list[Path]:
-    """Data sets of `refu simulate`: folders as they are, globs, and folders of data sets.
+    """Data sets of `refu simulate`, given as their folders, as globs, and as folders of data sets.
 
     Raises `RefuError` for a glob that nothing matches.
     """
@@ -82,7 +82,7 @@ def find_data_sets(inputs: Sequence[str]) -> list[Path]:
 
 
 def _whole(place: str) -> str:
-    """A path or URL as the URL that it is, links followed."""
+    """A path or URL as a full URL, with links resolved."""
     fs, path = filesystem(place if is_url(place) else os.path.realpath(place))
     return str(fs.unstrip_protocol(path)).rstrip("/")
 
@@ -106,7 +106,7 @@ def _find(text: str) -> Iterator[str]:
 
 
 def _walk(steps: Iterable[tuple[str, Any, Iterable[str]]], folder: str) -> Iterator[str]:
-    """Recordings in a folder by what `os.walk` gives of it; the folder itself where it is one."""
+    """Recordings in a folder, from the steps of `os.walk`; the folder itself if it is a bag."""
     bags: list[PurePosixPath] = []
     for place, _, files in sorted((PurePosixPath(place), None, [*files]) for place, _, files in steps):
         is_hidden = any(part.startswith(".") for part in place.relative_to(folder).parts)
@@ -123,7 +123,7 @@ def _walk(steps: Iterable[tuple[str, Any, Iterable[str]]], folder: str) -> Itera
 
 
 def _named(sources: Iterable[str]) -> Iterator[Input]:
-    """With what distinguishes their paths as names."""
+    """The inputs, named by what distinguishes their paths."""
     paths = {
         source: PurePosixPath(source.partition("://")[2] if is_url(source) else str(Path(source).absolute()))
         for source in sources

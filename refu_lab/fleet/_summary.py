@@ -1,4 +1,4 @@
-"""What a fleet's recordings come to: a table, JSON, and a page that leads to each one's report."""
+"""Summary of a fleet's recordings: a table, JSON, and a page with links to each one's report."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from refu_lab.tables import REPLAY_HEADER, REPLAY_TITLE, format_table, html_page
 _HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
 _WORST_HEADER = ("recording", "frame", "time s", "inside", "pairs", "depth mm")
 _SHOWN = 10
-"""Worst frames over all recordings, and warnings, that are shown."""
+"""How many worst frames over all recordings, and how many warnings, are shown."""
 
 
 @dataclass(eq=False)
 class FleetResult:
-    """The records of recordings in the order of the command."""
+    """The recordings' records, in the order of the command."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    """Each with `name` and `input`, and what `ReplayResult.as_dict` gives, or `error`."""
+    """Each has `name` and `input`, and either the values of `ReplayResult.as_dict` or `error`."""
     n_left: int = 0
-    """Recordings that weren't come to."""
+    """Number of recordings that weren't reached."""
     interrupted: bool = False
     is_kept: bool = False
-    """Whether what is finished is in a folder, so that the same command goes on from there."""
+    """Whether finished results are kept in a folder, so that the same command can resume from there."""
 
     @property
     def failed(self) -> list[dict[str, Any]]:
@@ -39,7 +39,7 @@ class FleetResult:
         return sorted(found, key=lambda frame: list(frame["badness"]), reverse=True)[:_SHOWN]
 
     def warnings(self) -> list[str]:
-        """What there is to warn of, and in which recordings, what is most frequent first."""
+        """Warnings and the recordings they are about, the most frequent first."""
         of: dict[str, list[str]] = {}
         for row in self.rows:
             for warning in row.get("warnings", ()):
@@ -73,7 +73,7 @@ class FleetResult:
         }
 
     def page(self) -> str:
-        """The page over all of them, `index.html` of the reports' folder."""
+        """The page about all recordings, `index.html` in the folder of the reports."""
         from refu_lab.report import STYLE
 
         garments = html_table(
@@ -100,7 +100,7 @@ class FleetResult:
 
 
 def fleet_table(result: FleetResult) -> str:
-    """What `refu replay` prints of several recordings."""
+    """What `refu replay` prints for several recordings."""
     lines = [format_table(_HEADER, [_cells(row) for row in result.rows])] if result.rows else []
     if garments := replay_rows(result.garments()):
         lines += ["", format_table(REPLAY_HEADER, garments)]
@@ -134,7 +134,7 @@ def _worst_cells(frame: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _merged(parts: list[Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures over all frames: means weigh by frames, depths are the largest, percentiles of latency the largest."""
+    """Figures over all frames: means weighted by frames; of depths and latency percentiles, the largest."""
     merged: dict[str, Any] = {"n_frames": sum(part["n_frames"] for part in parts)}
     for name in parts[0]:
         if name == "latency_ms":

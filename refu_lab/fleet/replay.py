@@ -1,4 +1,4 @@
-"""Replays many recordings: each is a task whose results, once in their place, are never made again."""
+"""Replays many recordings: each is a task, and one that is finished isn't run again."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from refu_lab.fleet._summary import FleetResult
 from refu_lab.replay import ReplayResult, replay
 
 WORST = 5
-"""Frames of a recording that its record names, the worst first."""
+"""Number of a recording's worst frames that are listed in its record."""
 _NOT_CONTENT = ("input", "output", "overwrite", "speed")
-"""Options that results don't depend on, or by what is read alone."""
+"""Options that results don't depend on, or only through the content of what is read."""
 _CODE = (
     "refu_core/**/*.py",
     "refu_core/assets/*.npz",
@@ -35,7 +35,7 @@ _CODE = (
     "msg_adapters/**/*.py",
     "refu_lab/*.py",
 )
-"""Files of the project that results depend on: not what Python compiles of them, whenever it is written."""
+"""Files of the project that results depend on, without the bytecode that Python compiles from them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,17 +43,17 @@ class FleetOptions:
     """How recordings are replayed, and where their results go."""
 
     replay: ReplayOptions
-    """For each of them; input and output are left out of account."""
+    """How each one is replayed; its input and output are ignored."""
     output: str | None = None
     """Folder or URL of the bags: NAME.mcap."""
     report: str | None = None
-    """Folder or URL of the reports: index.html over all, NAME/index.html."""
+    """Folder or URL of the reports: index.html for all together, NAME/index.html for each."""
     again: bool = False
-    """Whether what is finished is made again."""
+    """Whether finished recordings are replayed again."""
 
     @property
     def records(self) -> str | None:
-        """Folder of the records, NAME.json: what makes a recording finished."""
+        """Folder of the records, NAME.json: a recording that has one is finished."""
         return self.output or self.report
 
 
@@ -66,15 +66,15 @@ class _Job:
 def replay_fleet(
     recordings: list[Input], options: FleetOptions, *, engine: Engine, progress: bool = False
 ) -> FleetResult:
-    """Replays what isn't finished; a recording that can't be replayed is a row that says why.
+    """Replays the recordings that aren't finished; the row of one that can't be replayed says why.
 
     An interrupt (Ctrl-C) ends the run early: what is finished is kept and returned.
 
     Raises:
         RefuError: options that make no pipeline, a folder that can't be written or that another run writes to, or an
-            engine that is out of reach.
+            engine that can't be reached.
     """
-    pipeline_for(options.replay)  # what no recording could be replayed with is said once, and now
+    pipeline_for(options.replay)  # options that fail for every recording are reported once, and now
     result = FleetResult(is_kept=(options.output or options.report) is not None)
     rows: dict[int, dict[str, Any]] = {}
     with ExitStack() as stack:
@@ -98,7 +98,7 @@ def replay_fleet(
 
 
 def _replay_job(job: _Job) -> dict[str, Any]:
-    """The record of a recording: the one that there is, or a new one. What is wrong with it is in it."""
+    """A recording's record, existing or new; if it can't be replayed, the record is the error."""
     try:
         with fetched(job.recording.source) as path:
             return _finished_or_new(job, path)
@@ -125,9 +125,9 @@ def _finished_or_new(job: _Job, path: Path) -> dict[str, Any]:
 
 
 def _require_free(job: _Job, records: Folder) -> None:
-    """Raises `RefuError` where results without a record would take the place of anything but such results.
+    """Raises `RefuError` where a recording without a record would write over anything but results of `refu replay`.
 
-    A run that was killed leaves those.
+    A run that was killed leaves results without a record.
     """
     options, name = job.options, job.recording.name
     taken = {records.at(f"{name}.json"): records.size(f"{name}.json") is not None}
@@ -156,10 +156,10 @@ def _make(job: _Job, path: Path) -> dict[str, Any]:
     with ExitStack() as stack:
         bag = None
         if options.output is not None:
-            # A bag holds its own name.
+            # A bag contains its own name, so it is written under it.
             bag = stack.enter_context(Folder(options.output).scratch()) / f"{Path(name).name}.mcap"
         result = replay(replace(options.replay, input=path, output=bag), pipeline=pipeline)
-        if result.interrupted:  # a part isn't what this is a record of
+        if result.interrupted:  # a record is of a whole recording
             raise KeyboardInterrupt
         if options.output is not None and bag is not None:
             size, output = bag.stat().st_size, Folder(options.output).at(f"{name}.mcap")
@@ -176,11 +176,11 @@ def _make(job: _Job, path: Path) -> dict[str, Any]:
 
 
 _loaded: dict[str, GarmentPipeline] = {}
-"""This process's pipelines by what is in their options; two, as a few modes may take turns."""
+"""This process's pipelines by the content of their options; at most two, which may take turns."""
 
 
 def pipeline_for(options: ReplayOptions) -> GarmentPipeline:
-    """This process's pipeline for recordings: loading one takes as long as many frames. Raises as `load_pipeline`."""
+    """This process's pipeline for these options, kept since loading one takes long. Raises as `load_pipeline`."""
     content = _content(options)
     if content not in _loaded:
         for oldest in [*_loaded][:-1]:
@@ -219,20 +219,20 @@ def _over_all(result: ReplayResult) -> dict[str, Any]:
 
 
 def _key(job: _Job, path: Path) -> str:
-    """Of what is read, how it is replayed, and with what code and weights."""
+    """Hash of the recording, of how it is replayed, and of the code and weights."""
     read = (job.recording.name, _recording_hash(job.recording.source, path))
     told = (__version__, code_hash(*_CODE), *read, _content(job.options.replay))
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
 def _content(options: ReplayOptions) -> str:
-    """What results depend on."""
+    """The options that results depend on, as text."""
     names = [option.name for option in fields(options) if option.name not in _NOT_CONTENT]
     return json.dumps({name: _told(getattr(options, name)) for name in names})
 
 
 def _told(value: Any) -> Any:
-    """An option by its content: files and folders by what is in them."""
+    """An option's value by its content: files and folders by a hash of what is in them."""
     if isinstance(value, (list, tuple)):
         return [_told(one) for one in value]
     if isinstance(value, Path) or (isinstance(value, str) and Path(value).is_file()):
@@ -244,12 +244,12 @@ def _recording_hash(source: str, path: Path) -> str:
     if is_url(source):
         fs, there = filesystem(source)
         if not fs.isdir(there):
-            return str(fs.ukey(there))  # what a store says of a file's version, without reading it again
+            return str(fs.ukey(there))  # the store's version of the file, without reading it again
     return _tree_hash(path)
 
 
 def _tree_hash(path: Path) -> str:
-    """Of a file, or of a folder's files by their names; of nothing where there is nothing."""
+    """Hash of a file, or of a folder's files and their names; that of nothing if there is none."""
     digest = hashlib.sha256()
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     for file in (one for one in files if one.is_file()):

@@ -1,4 +1,4 @@
-"""The paper's tables and figures on our own data, each figure beside the paper's; `refu evaluate` is made of this."""
+"""The paper's tables and figures on our own data, each figure beside the paper's, for `refu evaluate`."""
 
 from refu_lab.reproduction._build import POSTURE_METHODS as POSTURE_METHODS
 from refu_lab.reproduction._build import SAMPLE_TABLES as SAMPLE_TABLES

@@ -1,4 +1,4 @@
-"""Finding and loading what training made."""
+"""Finds and loads what training made."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from refu_lab.reproduction._methods import Method
 
 
 class Library:
-    """Trained weights: those of some folders, `<folder>/<garment>/<weights>`, before those that ship."""
+    """Trained weights: those in given folders, `<folder>/<garment>/<weights>`, before those that ship."""
 
     def __init__(self, folders: Sequence[Path] = (), *, collider: bool = True, body: str | None = None) -> None:
-        """Looks into `folders` first, in their order; what is loaded is brought off the collider, or off the skin.
+        """Searches `folders` first, in their order; collisions are resolved against the collider or against the skin.
 
-        It is for a `body`, a name or a file, or (None) for the one that each garment is cut for.
+        Networks are loaded for a `body`, given by name or file; None takes the one that each garment is made for.
 
-        Raises `BodyError` where there is no such body, or one that garments can't be transferred to.
+        Raises `BodyError` if there is no such body, or garments can't be transferred to it.
         """
         self._folders = tuple(folders)
         self.collider = collider
@@ -33,23 +33,23 @@ class Library:
         self._named = body
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Another process loads the body itself."""
+        """Pickled without the body, which another process loads itself."""
         return partial(Library, collider=self.collider, body=self._named), (self._folders,)
 
     def find(self, method: Method, garment: str) -> Path:
-        """The weights' files without suffix. Raises `WeightsError` where there are none."""
+        """Path of the weights' files, without suffix. Raises `WeightsError` if there are none."""
         assert method.weights is not None
         return self._find(method.weights, garment)
 
     def load(self, method: Method, garment: str) -> Wearable:
-        """A method's networks. Raises `WeightsError` where they are missing, damaged or of another body."""
+        """A method's networks. Raises `WeightsError` if they are missing, damaged or for another body."""
         stored = load_weights(self.find(method, garment), expect={"garment": garment})
         return wearable_of(stored, load_garment(garment), self.fit)
 
     def pipeline(self, method: Method, *garments: str) -> GarmentPipeline:
-        """What the node runs in the method's mode, where that has networks; or its backbone, with nothing handled.
+        """The node's pipeline if the method is the node in some mode, else its backbone without collision handling.
 
-        Raises `RefuError` where garments worn together have no weights in one folder.
+        Raises `RefuError` if the garments, worn together, don't all have weights in one folder.
         """
         weights = None if method.weights is None else self.find(method, garments[0]).parent.parent
         is_node = method.handling == "node"
@@ -63,7 +63,7 @@ class Library:
         )
 
     def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:
-        """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` where there is none."""
+        """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` if there is none."""
         stem = self._find(f"sdf-{preset}", garment)
         return NeuralSdf(load_sdf_network(stem, body).eval().requires_grad_(False), body)
 

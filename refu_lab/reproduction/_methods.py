@@ -1,4 +1,4 @@
-"""The methods that are compared: what each predicts with, how it handles collisions, and what trains it."""
+"""The methods compared: what each predicts with, how it handles collisions, and which command trains it."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ class Method:
     mode: str = "none"
     """How the backbone was trained; `none` without collision handling. Weights are called `<backbone>-<mode>`."""
     folder: str = ""
-    """Folder below the garment's that they lie in, where they were trained other than those that ship."""
+    """Subfolder of the garment's folder with these weights, if they were trained unlike those that ship."""
     handling: Handling = "none"
-    """What happens to the backbone's garment: nothing; x - f ∇f (naive); sparse least squares (optimisation); ReFU as
-    in the paper; or whatever the node does, in that mode: ReFU, a second look at what it moved, edges, limbs."""
+    """What is done to the backbone's garment: nothing; x - f ∇f (naive); sparse least squares (optimisation); ReFU as
+    in the paper; or all that the node does in that mode: ReFU, a second look at what it moved, edges, limbs."""
     sdf: SdfName | None = None
     """Signed distance at run time."""
     margin: float | None = None
-    """ε in place of the trained one, or of the optimisation's own 1 mm [m]."""
+    """ε that replaces the trained one, or the optimisation's own 1 mm [m]."""
     is_kept: bool = False
-    """Whether the optimisation keeps ε of all vertices: of those outside, too, which DRAPE leaves alone."""
+    """Whether the optimisation keeps all vertices ε off the skin, also those outside, which DRAPE leaves alone."""
     is_blended: bool = True
-    """Whether ReFU's pushes take the neighbourhood along, which the paper's don't."""
+    """Whether ReFU's pushes take neighbouring vertices along, which the paper's don't."""
     base: str = "tailornet"
-    """The method whose colliding vertices are the region of the local Laplacian error."""
+    """The method whose colliding vertices the local Laplacian error is measured at."""
 
     @property
     def weights(self) -> str | None:
-        """Path of the weights' files below the garment's folder, without suffix; None where no network is needed."""
+        """Path of the weights' files in the garment's folder, without suffix; None if no network is needed."""
         return None if self.backbone == "skinned" else f"{self.folder}/{self.backbone}-{self.mode}".lstrip("/")
 
     def train_command(self, garment: str) -> str:
-        """The command that makes the weights; empty where none are needed."""
+        """The command that trains the weights; empty if none are needed."""
         if self.weights is None:
             return ""
         folder = f"weights/{garment}" + (f"/{self.folder}" if self.folder else "")
@@ -60,16 +60,16 @@ _TRAINING: Mapping[str, str] = {
     "alt2": "--scale distance",
     "bare": "--margin 0 --unblended",
 }
-"""What is special about the training of the weights in each folder, as options of `refu train`."""
+"""Special options of `refu train` for the weights in each folder."""
 SEQUENCE_SHAPES = (5, 17)
-"""Body shapes of the paper's two sets of sequences."""
+"""Numbers of body shapes in the paper's two sets of sequences."""
 _SDFS: tuple[SdfName, ...] = ("approx", "accurate")
 _RUN_TIME_SDF: Mapping[str, SdfName] = {"approx": "approx", "accurate": "accurate", "hybrid": "approx"}
-"""Hybrid: the accurate distance is in the training's loss, the approximate one in ReFU (paper, Sec. "Settings")."""
+"""Hybrid uses the accurate distance in the training loss, the approximate one in ReFU (paper, Sec. "Settings")."""
 
 
 def _variant(of: Method, suffix: str, label: str, **changes: Any) -> Method:
-    """Another method with `suffix` behind its name and `label` behind its label."""
+    """A changed method, with `suffix` appended to its name and `label` to its label."""
     return replace(of, name=of.name + suffix, label=of.label + label, **changes)
 
 
@@ -103,7 +103,7 @@ def _post_processes() -> Iterator[Method]:
 
 
 def _refu() -> Iterator[Method]:
-    """ReFU as trained, at run time without blending and margin, trained without (the paper's layer), in the node."""
+    """ReFU as trained; without blending and margin at run time; trained without them (the paper's layer); the node."""
     for mode, sdf in _RUN_TIME_SDF.items():
         refu = Method(f"refu-{mode}", f"ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
         yield from _ablated(refu)
@@ -125,7 +125,7 @@ def _ablated(whole: Method) -> Iterator[Method]:
 
 
 def _trained_bare(whole: Method, name: str, *, folder: str) -> Method:
-    """By the weights in `folder`, whose ε is 0 already."""
+    """The same method with the weights in `folder`, whose ε is 0 already."""
     label = f"{whole.label}, not blended, ε = 0, trained so (the paper's)"
     return replace(whole, name=name, label=label, folder=folder, is_blended=False)
 

@@ -1,4 +1,4 @@
-"""Real motion: every frame of recorded clips, every vertex, against the collider and against the skin."""
+"""Recorded motion: checks every vertex in every frame of clips against the collider and against the skin."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from refu_lab.reproduction._methods import METHODS
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
 
 OUTFITS = (DEFAULT_GARMENTS, ("shirt-male",), ("skirt-female",))
-"""What is worn together."""
+"""Garments that are worn together."""
 MOTION_METHODS = ("node-hybrid", "node-accurate")
-"""What is shown for every clip, in the order of the rows."""
+"""Methods that are shown for every clip, in the order of the rows."""
 NEAR = 0.02
-"""A self-intersection of the collider this close to a garment [m] takes its room."""
+"""A self-intersection of the collider counts if it is this close to a garment [m]."""
 _RATE = 60.0
-"""Jumps are between frames about this far apart [1/s]."""
+"""Jumps are measured between frames that are about 1/`_RATE` s apart [Hz]."""
 _MOVED = 1e-4
-"""Skin that was moved by more than this counts as moved [m]."""
-_BIN = 1e-5  # [m]: to this percentiles of the skin's shift are known
+"""A vertex of the skin that went farther than this counts as moved [m]."""
+_BIN = 1e-5  # [m]; resolution of the percentiles of the skin's shift
 _LONGEST_WAY = 0.2  # [m]
 _STRETCHED = 2.0
 _SKIN = "skin"
@@ -67,7 +67,7 @@ def motion_table(
 ) -> ResultTable:
     """Collisions, jumps, stretch and crossings of each garment, and how far skin was moved, clip by clip.
 
-    Of the recorded motions by name, `every` so many frames one is dressed and judged.
+    `clips` are recorded motions by name; one frame in `every` so many is dressed and judged.
     """
     labels = {name: METHODS[name].label for name in MOTION_METHODS} | {_SKIN: "skin to collider"}
     table = ResultTable("motion", "Recorded motion", _ABOUT, labels=labels)
@@ -119,14 +119,14 @@ def motion_table(
 
 
 class SkinShifts:
-    """How far vertices of the skin went to where they are on the collider, of many frames."""
+    """How far vertices of the skin are moved to their places on the collider, over many frames."""
 
     def __init__(self) -> None:
         self._count = np.zeros(int(_LONGEST_WAY / _BIN) + 1, np.int64)
         self._sum, self._largest, self._moved = 0.0, 0.0, 0
 
     def add(self, way: NDArray[np.floating]) -> None:
-        """Takes in the ways of a frame's vertices [m], shape (V,)."""
+        """Adds the distances that a frame's vertices were moved by [m], shape (V,)."""
         np.add.at(self._count, np.minimum((way / _BIN).astype(np.int64), len(self._count) - 1), 1)
         self._sum += float(way.sum())
         self._largest = max(self._largest, float(way.max()))
@@ -134,7 +134,7 @@ class SkinShifts:
 
     @classmethod
     def joined(cls, parts: Iterable[SkinShifts]) -> SkinShifts:
-        """Of all frames of `parts`."""
+        """The shifts of all frames in `parts`."""
         whole = cls()
         for part in parts:
             whole._count += part._count
@@ -144,7 +144,7 @@ class SkinShifts:
         return whole
 
     def rows(self, group: str) -> list[ResultRow]:
-        """Mean, 99th percentile (to a hundredth of a millimetre), largest, and share of the vertices that moved."""
+        """Rows of the mean, 99th percentile (to 0.01 mm) and largest shift, and of the share of vertices that moved."""
         n = int(self._count.sum())
         if not n:
             return []
@@ -160,7 +160,7 @@ class SkinShifts:
 
 @dataclass(frozen=True)
 class Judged:
-    """One garment in one frame, as one method makes it."""
+    """Figures of one garment in one frame, as one method makes it."""
 
     on_collider: FrameMetrics
     is_free_of_skin: bool
@@ -175,7 +175,7 @@ class Judged:
 
 
 def figures_of(judged: Sequence[Judged]) -> dict[str, float | None]:
-    """The figures of a garment over some frames, by metric; None where nothing is worn with it."""
+    """The figures of a garment over some frames, by metric; `layers_cut_percent` is None for one worn alone."""
     figures = Figures.over([one.on_collider for one in judged])
     jumps = np.array([one.jump_mm for one in judged])
     layers = [one.is_layer_cut for one in judged if one.is_layer_cut is not None]
@@ -201,7 +201,7 @@ def _rows(group: str, method: str, judged: Sequence[Judged]) -> list[ResultRow]:
 
 
 class OutfitJudge:
-    """Garments worn together, as every method makes them, and what judges them."""
+    """Dresses garments worn together by every method, and judges them."""
 
     def __init__(self, garments: Sequence[str], pipelines: Mapping[str, GarmentPipeline]) -> None:
         self._pipelines = pipelines
@@ -217,7 +217,7 @@ class OutfitJudge:
         self._lengths = lru_cache(maxsize=64)(self._rest_lengths)
 
     def _make_detector(self, betas: bytes) -> SelfContactDetector:
-        """Which faces cross at rest already (toes) depends on the shape."""
+        """A detector for one shape: which faces cross at rest already (toes) depends on it."""
         shape = torch.from_numpy(np.frombuffer(betas, np.float32).copy())[None]
         return SelfContactDetector(self.body.faces, self.body.rest_vertices(shape)[0])
 
@@ -227,13 +227,13 @@ class OutfitJudge:
         return self._edge_lengths(garment, rest)
 
     def _edge_lengths(self, garment: str, vertices: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Of each edge [m], shape (E,)."""
+        """Length of each edge [m], shape (E,)."""
         a, b = vertices[self._skinned.garments[garment].mesh.edges.T]
         lengths: NDArray[np.floating] = np.linalg.norm(a - b, axis=1)
         return lengths
 
     def judge(self, frames: Sequence[SmplFrame]) -> tuple[dict[tuple[str, str], Judged], NDArray[np.floating]]:
-        """Judges the first of two frames, by (garment, method), and how far its skin went [m], shape (V,)."""
+        """Judges the first of two frames, by (garment, method); and how far its skin was moved [m], shape (V,)."""
         skinned = self._skinned(frames)
         contact: SelfContact | None = None
         judged: dict[tuple[str, str], Judged] = {}
@@ -276,12 +276,12 @@ class OutfitJudge:
 
 
 def frame_pair(clip: Motion, index: int) -> list[SmplFrame]:
-    """A frame of a clip and the one 1/60 s later, told what was before them."""
+    """A frame of a clip and the one about 1/60 s later, each with its past."""
     first = max(0, index - math.ceil(LAGS[-1] * clip.fps) - 1)
     frames = PoseHistory.told(map(clip.frame, range(first, index + _step(clip) + 1)))
     return [frames[index - first], frames[-1]]
 
 
 def _step(clip: Motion) -> int:
-    """Frames from one to the next of a pair."""
+    """Number of frames from the first to the second of a pair."""
     return max(1, round(clip.fps / _RATE))

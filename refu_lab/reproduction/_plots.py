@@ -1,6 +1,6 @@
 """The supplement's plots: energy histograms, scale against distance ratio, collisions far from the training set.
 
-And pictures of test samples: the backbone alone beside ReFU and the truth.
+Also pictures of test samples: the backbone alone beside ReFU and the truth.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _SIZE = (8.4, 3.6)
 
 
 def plot_energy(study: Study, folder: Path) -> list[tuple[str, str]]:
-    """`energy.svg` and `energy_zoom.svg`: samples by penetration energy, all garments together.
+    """Writes `energy.svg` and `energy_zoom.svg`: samples by penetration energy, all garments together.
 
-    Returns (file, caption) of what there was data for, as the other plots do.
+    Like the other plots, it returns (file, caption) of each file that there was data for.
     """
     shown = _shown(study, ("tailornet", "refu-hybrid"))
     if len(shown) < 2:
@@ -46,7 +46,7 @@ def plot_energy(study: Study, folder: Path) -> list[tuple[str, str]]:
 
 
 def plot_scale(study: Study, folder: Path) -> list[tuple[str, str]]:
-    """`scale.svg`: mean α by the ratio of approximate to accurate distance."""
+    """Writes `scale.svg`: mean α by the ratio of approximate to accurate distance."""
     shown = _shown(study, ("refu-approx", "refu-hybrid"))
     shown = {label: runs for label, runs in shown.items() if sum(run.scales.count.sum() for run in runs)}
     if not shown:
@@ -71,7 +71,7 @@ def plot_scale(study: Study, folder: Path) -> list[tuple[str, str]]:
 
 
 def plot_unseen(study: Study, folder: Path) -> list[tuple[str, str]]:
-    """`unseen.svg`: collision error against the distance to the training set."""
+    """Writes `unseen.svg`: collision error against the distance to the training set."""
     methods = ("tailornet", "collision-loss-accurate", "collision-loss-approx", "refu-approx", "refu-hybrid")
     figure, (ax,) = new_axes(size=_SIZE)
     for method, colour in zip(methods, COLOURS, strict=True):
@@ -89,11 +89,11 @@ def plot_unseen(study: Study, folder: Path) -> list[tuple[str, str]]:
 
 
 PLOTS = {"energy": plot_energy, "alpha": plot_scale, "unseen": plot_unseen}
-"""What draws the plots of a table."""
+"""The functions that draw the plots of each table."""
 
 
 def _shown(study: Study, methods: tuple[str, ...]) -> dict[str, list[MethodRun]]:
-    """The runs of those methods that were run on all garments, by label."""
+    """The runs of those of the methods that were run on all garments, by label."""
     return {METHODS[name].label: runs for name in methods if (runs := study.pooled(name))}
 
 
@@ -103,10 +103,10 @@ _SHOT = (420, 560)
 def picture_garments(
     study: Study, sets: Sequence[SampleSet], folder: Path, *, library: Library
 ) -> list[tuple[str, str]]:
-    """`<garment>.png`: a sample with many collisions, the backbone alone beside ReFU and the truth.
+    """Writes `<garment>.png`: a sample with many collisions, the backbone alone beside ReFU and the truth.
 
-    The sample is at the 90th percentile of vertices inside, as the backbone leaves them: hard, and not hand-picked.
-    Returns (file, caption) of the garments whose networks there are; without networks, the skinned template is shown.
+    The sample is at the 90th percentile of vertices inside after the backbone: hard, but not hand-picked. Returns
+    (file, caption) of each picture. Without networks the skinned template is shown, where it was run.
     """
     pictures = []
     for samples in sets:

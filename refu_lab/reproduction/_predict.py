@@ -1,4 +1,4 @@
-"""A method at work: one sample's body in, the garment that the method makes of it out, each stage timed."""
+"""Runs a method: takes one sample's body, gives the garment that the method makes for it, and times each stage."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from refu_lab.reproduction._methods import Method
 
 
 class GarmentSetup:
-    """What all methods share for one garment: template, body, distances, and the hints that the fast one asks for."""
+    """What all methods share for one garment: template, body, distances, and the hints that the fast one needs."""
 
     def __init__(self, garment: str, library: Library) -> None:
-        """Prepares a built-in garment on the library's body, whose overlaps are pulled apart or not."""
+        """Prepares a built-in garment on the library's body, with or without its collider."""
         fit = library.fit
         self.template = worn_on(load_garment(garment), fit)
         self.body = load_body(self.template.body) if fit is None else fit.body
@@ -41,21 +41,21 @@ class GarmentSetup:
             "accurate": self.exact.of_garment(self.template),
             "approx": self.approx.of_garment(self.template),
         }
-        """The distances of the garment's own vertices."""
+        """Functions that give the distances of the garment's own vertices."""
         self.rest_faces = RestFaces(self.body)
         self.post_process = PostProcess(self.template.faces, self.template.n_vertices)
         self.blend = Blend.of_faces(self.template.faces, self.template.n_vertices)
 
     def near(self, unposed: Tensor, betas: Tensor) -> Tensor:
-        """A body face near each vertex of an unposed garment [m], shape (N, 3), for betas (1, 10); shape (N,)."""
+        """A body face near each vertex, shape (N,), of an unposed garment [m], shape (N, 3), for betas (1, 10)."""
         return self.rest_faces.under(unposed[None], betas, self.template.shapedirs)[0]
 
 
 class SampleScene:
-    """One sample's body, posed; the distances to it are made ready when the first method asks."""
+    """One sample's posed body; the distances to it are prepared when a method first asks for them."""
 
     def __init__(self, setup: GarmentSetup, pose: ArrayLike, betas: ArrayLike, style: ArrayLike) -> None:
-        """Of a pose (24, 3) [rad], betas (10,) and style (4,)."""
+        """Poses the body: pose (24, 3) [rad], betas (10,), style (4,)."""
         self.setup = setup
         self.pose, self.betas, self.style = (
             torch.from_numpy(np.asarray(value, np.float32))[None] for value in (pose, betas, style)
@@ -67,7 +67,7 @@ class SampleScene:
         self._update_ms: dict[str, float] = {}
 
     def sdf(self, name: str) -> tuple[BodySdf, float]:
-        """The distance of that name to this body, and how long it took to take over the body [ms]."""
+        """The distance of that name to this body, and how long its update to the body took [ms]."""
         sdf: BodySdf = self.setup.exact if name == "accurate" else self.setup.approx
         if name not in self._update_ms:
             start = time.perf_counter()
@@ -88,7 +88,7 @@ class MethodOutput(NamedTuple):
     approx: Tensor
     """Their signed distance as ReFU saw it [m], shape (R,)."""
     accurate: Tensor
-    """And the accurate one [m], shape (R,)."""
+    """Their accurate signed distance [m], shape (R,)."""
 
 
 class Predictor:
@@ -183,7 +183,7 @@ class Predictor:
 
 
 def _with_margin(refu: Refu, margin: float | None) -> Refu:
-    """The layer with another ε; itself for None."""
+    """The layer with another ε; with None, the layer itself."""
     if margin is None:
         return refu
     other = Refu.from_config({**refu.config, "margin": margin})

@@ -1,4 +1,4 @@
-"""Methods on the test samples of a data set: every figure of every sample, kept for all tables."""
+"""Runs methods on the test samples of a data set; keeps every figure of every sample for all tables."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from refu_lab.reproduction._tables import Missing
 from refu_lab.truth import garments_of, moments_of
 
 RATIO_EDGES: tuple[float, ...] = (0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.25, 3.75, 4.25, 4.75, float("inf"))
-"""Groups of the ratio of approximate to accurate distance, as in the supplement's bar plot."""
+"""Limits of the groups by ratio of approximate to accurate distance, as in the supplement's bar plot."""
 _BLOCK = 8
-"""Samples of a task: some seconds' work."""
+"""Samples in a task: a few seconds' work."""
 
 
 class Sample(NamedTuple):
@@ -43,9 +43,9 @@ class Sample(NamedTuple):
     style: NDArray[np.float32]
     """γ, shape (4,)."""
     unseen: float
-    """Distance to the nearest training sample in (θ, β, γ); NaN where it isn't known."""
+    """Distance to the nearest training sample in (θ, β, γ); NaN if it isn't known."""
     posture: str | None = None
-    """Which of `POSTURES` the pose is one of; None where it is another, or isn't known."""
+    """Name of the pose in `POSTURES`; None if it is another pose, or isn't known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,24 +55,25 @@ class SampleSet:
     garment: str
     count: int
     shapes: int | None
-    """Body shapes of a set of sequences; None for a set of poses."""
+    """Number of body shapes in a set of sequences; None for a set of poses."""
     read: Callable[[int], Sample]
-    """The sample of a number from 0 to `count` - 1."""
+    """Reads the sample of a number from 0 to `count` - 1."""
 
     def __len__(self) -> int:
         return self.count
 
     def thinned(self, most: int) -> SampleSet:
-        """At most so many of these samples, evenly spread."""
+        """At most `most` of these samples, evenly spread."""
         rows = np.unique(np.linspace(0, self.count - 1, min(most, self.count)).round().astype(int))
         return replace(self, count=len(rows), read=lambda number: self.read(int(rows[number])))
 
     @classmethod
     def open(cls, path: Path) -> SampleSet:
-        """The test samples of the set in the folder `path`, finished so far, or those of a bag with ground truth.
+        """The test samples finished so far of the set in the folder `path`, or the samples of a bag with ground truth.
 
         Raises:
-            RefuError: no such set or bag, a damaged one, or one without a finished test sample of one garment.
+            RefuError: no such set or bag, a damaged one, one without a finished test sample, or a bag whose truth isn't
+                of one garment.
         """
         if any(one.suffix in BAG_SUFFIXES for one in (path, *path.glob("*"))):
             return _of_bag(path)
@@ -127,17 +128,17 @@ class ScaleByRatio:
     """Predicted scales α, grouped by the ratio of the approximate to the accurate distance."""
 
     count: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(RATIO_EDGES) - 1, np.int64))
-    """Vertices a group, shape (11,)."""
+    """Number of vertices in each group, shape (11,)."""
     total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(len(RATIO_EDGES) - 1))
-    """Sum of α a group, shape (11,)."""
+    """Sum of α in each group, shape (11,)."""
 
     def join(self, other: ScaleByRatio) -> None:
-        """Takes in another one."""
+        """Adds the counts and sums of another one."""
         self.count += other.count
         self.total += other.total
 
     def add(self, output: MethodOutput) -> None:
-        """Takes in the vertices that both distances see inside the body (the supplement's "collision-resolved")."""
+        """Adds the vertices that both distances put inside the body (the supplement's "collision-resolved")."""
         approx, accurate = output.approx.numpy(), output.accurate.numpy()
         inside = (approx < 0) & (accurate < 0)
         group = np.digitize(approx[inside] / accurate[inside], RATIO_EDGES) - 1
@@ -167,11 +168,11 @@ class MethodRun:
         return Figures.over(self.samples)
 
     def values(self, name: str) -> NDArray[np.float64]:
-        """A field of `FrameMetrics`, of all samples."""
+        """A field of `FrameMetrics` for all samples."""
         return np.array([getattr(sample, name) for sample in self.samples], np.float64)
 
     def median_ms(self, *components: str) -> float | None:
-        """Median time of some components together [ms]; None for one that the method hasn't."""
+        """Median time of some components together [ms]; None if the method lacks one."""
         if not self.samples or not set(components) <= set(self.ms):
             return None
         return float(np.median(np.sum([self.ms[component] for component in components], axis=0)))
@@ -182,14 +183,14 @@ class MethodRun:
 
     @classmethod
     def joined(cls, garment: str, method: str, runs: Iterable[MethodRun]) -> MethodRun:
-        """All samples of `runs`, in their order."""
+        """One run with all samples of `runs`, in their order."""
         whole = cls(garment, method)
         for run in runs:
             whole.join(run)
         return whole
 
     def join(self, other: MethodRun) -> None:
-        """Takes in the samples that follow."""
+        """Appends the samples of another run."""
         self.samples += other.samples
         self.unseen += other.unseen
         self.postures += other.postures
@@ -200,7 +201,7 @@ class MethodRun:
 
 @dataclass(eq=False)
 class Study:
-    """All runs, and what couldn't be run."""
+    """All runs, and the methods that couldn't be run."""
 
     runs: dict[tuple[str, str], MethodRun] = field(default_factory=dict)
     """By (garment, method)."""
@@ -209,7 +210,7 @@ class Study:
     """Test samples by garment."""
 
     def pooled(self, method: str) -> list[MethodRun]:
-        """The method's runs of all garments; none where one is missing, as means would be of other garments."""
+        """The method's runs on all garments; none if one is missing, as means would then be over other garments."""
         runs = [self.runs.get((garment, method)) for garment in self.n_samples]
         return [run for run in runs if run is not None] if None not in runs else []
 
@@ -223,11 +224,11 @@ def run_methods(
     engine: Engine | None = None,
     progress: bool = False,
 ) -> None:
-    """Runs methods by name, and the base of each, on the test samples of one garment, into `study`.
+    """Runs methods by name, and the base of each, on the test samples of one garment, and adds the runs to `study`.
 
-    `engine` runs them, a block of samples a task; None for this process. Figures don't depend on it, times do.
+    `engine` runs them, a block of samples a task; None stands for this process. Figures don't depend on it, times do.
 
-    Raises `RefuError` where blocks are lost with their processes, or those are out of reach.
+    Raises `RefuError` if blocks are lost with their processes, or the processes can't be reached.
     """
     garment = samples.garment
     study.n_samples[garment] = len(samples)
@@ -252,20 +253,20 @@ def run_methods(
             parts[index] = part
             bar.update(len(next(iter(part.values())).samples))
     for name in ready:
-        in_order = (parts[index][name] for index in sorted(parts))  # whoever was first
+        in_order = (parts[index][name] for index in sorted(parts))  # in whatever order they were done
         study.runs[garment, name] = MethodRun.joined(garment, name, in_order)
 
 
 @dataclass
 class _Runner:
-    """Makes a process's function from samples to their runs."""
+    """Makes a process's function, which turns samples into runs."""
 
     garment: str
     library: Library
     methods: tuple[str, ...]
     """Bases first."""
     made: tuple[GarmentSetup, Mapping[str, Predictor]] | None = None
-    """Of this process, where it has them already; another one makes its own."""
+    """Those that this process has already; another process makes its own."""
 
     def __call__(self) -> Callable[[list[Sample]], dict[str, MethodRun]]:
         if self.made is None:

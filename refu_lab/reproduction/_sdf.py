@@ -20,13 +20,13 @@ from refu_lab.reproduction._runs import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
 
 _AT_SURFACE = 1e-4
-"""Closer to the skin than this [m], a relative error says nothing."""
+"""Closer to the skin than this [m], a relative error means nothing."""
 MISS = 2e-3
 """An error above this [m] counts as a miss."""
 
 
 def sdf_errors(approximate: ArrayLike, accurate: ArrayLike) -> dict[str, float | None]:
-    """Errors of distances f against s [m], both of shape (P,), by metric; None where there are no points for it."""
+    """Errors of distances f against s [m], both of shape (P,), by metric; None if a metric has no points."""
     f, s = np.asarray(approximate, np.float64), np.asarray(accurate, np.float64)
     error: NDArray[np.float64] = np.abs(f - s)
     off = np.abs(s) > _AT_SURFACE
@@ -39,20 +39,20 @@ def sdf_errors(approximate: ArrayLike, accurate: ArrayLike) -> dict[str, float |
         "mean_relative_percent": mean(100.0, error[off] / np.abs(s[off])),  # Eq. 15
         "p99_mm": 1e3 * float(np.percentile(error, 99)) if len(error) else None,
         "missed_percent": mean(100.0, error > MISS),
-        "hidden_percent": mean(100.0, (s < -MISS) & (f >= 0)),  # inside and taken for outside: nobody sees it
+        "hidden_percent": mean(100.0, (s < -MISS) & (f >= 0)),  # inside but taken for outside, so it goes unnoticed
     }
 
 
 DISTURBANCE = 0.01
-"""Standard deviation of the Gaussian disturbance of every other point, each axis [m]."""
+"""Standard deviation along each axis of the Gaussian disturbance of half of the points [m]."""
 NEAR_SKIN = 0.02
-"""Within this of the skin [m] the distance decides what ReFU does."""
+"""Within this distance of the skin [m], errors matter for what ReFU does."""
 FOLDED_POSES = ("squat", "crossed arms", "hands on hips")
-"""Of `POSTURES`."""
+"""Names of the postures (of `POSTURES`) in which the body is folded."""
 _FOLDED_SHAPES = 8
-"""Body shapes that each of them is taken with."""
+"""Number of body shapes that each of them is tried with."""
 _POINTS_ASKED = 8
-"""The network is asked for every so-many-th vertex: it takes a second a thousand points on one core."""
+"""The network is asked for one vertex in so many: a thousand points take it a second on one core."""
 _CLOSE = ", within 2 cm"
 _NAMES = {"approx": "walk over the posed mesh (real time)", "neural": "the paper's network"}
 
@@ -65,8 +65,7 @@ class _Asked(NamedTuple):
 
 
 def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = False) -> ResultTable:
-    """Errors of each approximation at the garments' vertices, half of them disturbed: over the test samples, and where
-    the body is folded."""
+    """Errors of each approximation at (partly disturbed) garment vertices, in the test samples and in folded poses."""
     labels = dict(_NAMES)
     for name in _NAMES:
         labels[name + _CLOSE] = "the same, points within 2 cm of the skin"
@@ -113,7 +112,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
 
 
 class _Questions:
-    """Asks several distances about a garment on bodies, and keeps what they say."""
+    """Asks several distances about a garment on bodies, and keeps their answers."""
 
     def __init__(self, setup: GarmentSetup, sdfs: Mapping[str, BodySdf]) -> None:
         self._setup, self._sdfs = setup, sdfs
@@ -121,7 +120,7 @@ class _Questions:
         self._asked: dict[str, list[_Asked]] = {name: [] for name in sdfs}
 
     def ask(self, scene: SampleScene, vertices: Tensor) -> None:
-        """About a garment's vertices [m], shape (N, 3), half of them disturbed."""
+        """Asks about a garment's vertices [m], shape (N, 3), half of which it disturbs first."""
         disturbance = self._random.normal(scale=DISTURBANCE, size=vertices.shape)
         disturbance[self._random.random(len(disturbance)) < 0.5] = 0
         points = vertices + torch.from_numpy(disturbance.astype(np.float32))

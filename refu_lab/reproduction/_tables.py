@@ -1,4 +1,4 @@
-"""Tables of the reproduction: figures of ours, each beside the paper's, as pages and JSON."""
+"""Tables of the reproduction: our figures, each beside the paper's, as pages and JSON."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _PAPER_NOTE = (
 
 _MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
 _PRINTED = json.loads(Path(__file__).with_name("paper.json").read_text(encoding="utf-8"))
-"""By table: the methods, and their values by garment (empty where the supplement doesn't say which) and metric."""
+"""By table: the methods, and their values by garment (empty if the supplement doesn't name it) and metric."""
 
 PAPER: Mapping[tuple[str, str, str, str], float] = {
     (table, garment, method, metric): value
@@ -37,15 +37,15 @@ PAPER: Mapping[tuple[str, str, str, str], float] = {
     for metric, values in metrics.items()
     for method, value in zip(printed["methods"], values, strict=True)
 }
-"""(table, garment, method, metric) to what the paper prints."""
+"""The paper's figures by (table, garment, method, metric)."""
 
 
 def paper_figure(table: str, garment: str, method: str, metric: str) -> float | None:
-    """What the paper prints; None where it prints nothing.
+    """The figure that the paper prints; None if it prints none.
 
-    Where it doesn't name the garment, its figure stands beside that of any of ours. Its changes against the baseline
-    ("Trend") are computed anew from its own figures: the printed ones of VFCP aren't (.60 to .24 is -60 %, not -97.5
-    %).
+    If it doesn't name the garment, its figure stands beside each of ours. Its changes against the baseline ("Trend")
+    are recomputed from its own figures, as the printed ones of VFCP don't follow from them (.60 to .24 is -60 %, not
+    -97.5 %).
     """
     if metric.endswith("_trend"):
         value, base = (paper_figure(table, garment, m, metric[: -len("_trend")]) for m in (method, "tailornet"))
@@ -54,7 +54,7 @@ def paper_figure(table: str, garment: str, method: str, metric: str) -> float | 
 
 
 def published_modes() -> dict[str, dict[str, float]]:
-    """The paper's modes, all garments together: `ms` of a frame on a V100, and the errors."""
+    """The paper's figures of each mode, all garments together: `ms` a frame on a V100, and the errors."""
     found = {}
     for mode, sdf in (("approx", "sdf-approx"), ("hybrid", "sdf-approx"), ("accurate", "sdf-accurate")):
         ms = sum(PAPER["time", "all", component, "ms"] for component in ("backbone", sdf, "refu"))
@@ -69,7 +69,7 @@ class Metric(NamedTuple):
     digits: int
     higher_is_better: bool = False
     kind: str = ""
-    """Metrics of one kind stand side by side."""
+    """Metrics of one kind share a table."""
 
 
 METRICS: Mapping[str, Metric] = {
@@ -110,18 +110,18 @@ METRICS: Mapping[str, Metric] = {
     "vfcp_percent_trend": Metric("VFCP, change [%]", 1),
     "cfmp_percent_trend": Metric("CFMP, change [%]", 1, higher_is_better=True),
 }
-"""The metrics by the names they have in JSON. Those of a group that a table makes up (`error @ 1.5`) aren't here."""
+"""The metrics by their names in JSON, without those that a table makes up for its groups (`error [mm] at 1 to 1.5`)."""
 
 
 class ResultRow(NamedTuple):
-    """One figure, and the paper's; its fields are the keys of a row in JSON."""
+    """One of our figures and the paper's; its fields are the keys of a row in JSON."""
 
     table: str
     garment: str
     method: str
     metric: str
     value: float | None
-    """None where nothing was measured: not trained, or no sample that the metric is about."""
+    """None if nothing was measured: networks not trained, or no samples for this metric."""
     paper: float | None
 
     @classmethod
@@ -132,7 +132,7 @@ class ResultRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Missing:
-    """Why a method has no figures for a garment, and what to do about that."""
+    """Why a method has no figures for a garment, and how to get them."""
 
     garment: str
     method: str
@@ -143,7 +143,7 @@ class Missing:
 
 @dataclass(eq=False)
 class ResultTable:
-    """One table: its figures, what it lacks, what it is about."""
+    """One table: its figures, what is missing from it, and what it is about."""
 
     name: str
     title: str
@@ -154,14 +154,14 @@ class ResultTable:
     plots: list[tuple[str, str]] = field(default_factory=list)
     """(file name, caption)."""
     labels: Mapping[str, str] = field(default_factory=dict)
-    """Names for people of rows that aren't methods."""
+    """Readable names of rows that aren't methods."""
 
     def value(self, garment: str, method: str, metric: str) -> float | None:
-        """The figure measured; None where there is none."""
+        """The measured figure; None if there is none."""
         return next((row.value for row in self.rows if row[1:4] == (garment, method, metric)), None)
 
     def label(self, method: str) -> str:
-        """A row's name for people."""
+        """A row's readable name."""
         return self.labels.get(method) or (METHODS[method].label if method in METHODS else method)
 
     def markdown(self, *, source: str) -> list[str]:
@@ -175,19 +175,19 @@ class ResultTable:
         return parts + [picture_markdown(*plot) for plot in self.plots]
 
     def in_short(self) -> list[TextTable]:
-        """The figures of all garments or clips together, or of each where there are none of all."""
+        """The figures over all garments or clips together; those of each if there are none over all."""
         garments = _unique(row.garment for row in self.rows)
         summed = [garment for garment in garments if garment == ALL or garment.endswith("all clips")]
         return [grid for garment in summed or garments for grid in self.of_garment(garment)]
 
     def of_garment(self, garment: str) -> list[TextTable]:
-        """A garment's figures, metrics of one kind side by side."""
+        """A garment's figures: a table for each kind of metric."""
         rows = [row for row in self.rows if row.garment == garment]
         kinds = _unique(_kind(row.metric) for row in rows)
         return [self._grid(garment, [row for row in rows if _kind(row.metric) == kind]) for kind in kinds]
 
     def _grid(self, garment: str, rows: Sequence[ResultRow]) -> TextTable:
-        """Methods down, metrics across; the paper's beside those of which it has any."""
+        """A table of methods by metrics, with a column of the paper's beside each metric that it has any of."""
         metrics = _unique(row.metric for row in rows)
         in_paper = {row.metric for row in rows if row.paper is not None}
         found = {(row.method, row.metric): row for row in rows}
@@ -207,7 +207,7 @@ class ResultTable:
         return TextTable(f"{self.title}, {garment}", header, lines)
 
     def _reasons(self) -> list[str]:
-        """What is missing, why, and how to make it; methods that lack the same thing in one line."""
+        """Lines on what is missing, why, and how to make it; methods that lack the same thing share a line."""
         lacking: dict[tuple[str, str], list[str]] = {}
         for m in self.missing:
             lacking.setdefault((f"{m.garment}, {m.reason}", m.command), []).append(self.label(m.method))
@@ -219,7 +219,7 @@ class ResultTable:
     def write(self, folder: Path, *, command: str, n_samples: Mapping[str, int]) -> Path:
         """Writes `<name>.md` and `<name>.json`; returns the page.
 
-        `command` makes the table again, `n_samples` are the test samples it is of.
+        `command` makes the table again; `n_samples` are the numbers of test samples that it is based on.
 
         Raises:
             RefuError: the folder can't be written.
@@ -248,7 +248,7 @@ class ResultTable:
 
 
 def read_table(folder: Path, name: str) -> ResultTable | None:
-    """A table that was written; None where there is none.
+    """Reads a table that was written; None if there is none.
 
     Raises:
         RefuError: a file that isn't such a table.
@@ -268,7 +268,7 @@ def read_table(folder: Path, name: str) -> ResultTable | None:
 
 
 def is_summary(page: Path) -> bool:
-    """Whether a page is one that `write_summary` has written. Raises `RefuError` for one that can't be read."""
+    """Whether a page was written by `write_summary`. Raises `RefuError` if it can't be read."""
     try:
         return _SUMMARY in page.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -277,9 +277,9 @@ def is_summary(page: Path) -> bool:
 
 
 def write_summary(folder: Path) -> Path:
-    """Writes `README.md`: all tables that are in the folder, the main one's figures, the pictures.
+    """Writes `README.md`: links to all tables in the folder, the main one's figures, and the pictures.
 
-    What there is to say of the folder as a whole is taken from its `about.txt`.
+    A text about the folder as a whole is taken from its `about.txt`.
 
     Raises:
         RefuError: a file that isn't a table, or a folder that can't be written.
@@ -314,12 +314,12 @@ def write_summary(folder: Path) -> Path:
 
 
 def label_of(metric: str) -> str:
-    """A metric's name for people."""
+    """A metric's readable name."""
     return METRICS[metric].label if metric in METRICS else metric
 
 
 def format_value(metric: str, value: float | None) -> str:
-    """A figure for people; a dash where there is none."""
+    """A figure as text; a dash if there is none."""
     if value is None:
         return _NO_VALUE
     signed = "+" if metric.endswith("_trend") else ""
@@ -327,9 +327,9 @@ def format_value(metric: str, value: float | None) -> str:
 
 
 def weighted(values: Iterable[tuple[float | None, int]]) -> float | None:
-    """Mean of (value, number of samples), weighted by the numbers ("All Garments" of the paper).
+    """Mean of (value, number of samples) pairs, weighted by the numbers ("All Garments" in the paper).
 
-    None if one is missing: a mean over the others would be of other garments than the rows beside it.
+    None if a value is missing: a mean over the others would be over other garments than the rows beside it.
     """
     pairs = list(values)
     total = sum(count for _, count in pairs)

@@ -1,4 +1,4 @@
-"""Numerical stability, measured: everyday and hostile frames, what collision handling promises, and endurance."""
+"""Measures numerical stability: everyday and hostile frames, what collision handling promises, and endurance."""
 
 from refu_lab.stress._checks import CHECKS as CHECKS
 from refu_lab.stress._frames import FRAMES as FRAMES

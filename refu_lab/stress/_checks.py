@@ -1,4 +1,4 @@
-"""The table of checks: what is drawn, what is measured of it, how often, and in which modes it is promised."""
+"""The table of checks: what each one draws and measures, how often, and which modes promise it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from refu_lab.stress._trial import Check, Trial
 DrawTrial = Callable[[np.random.Generator], Trial]
 
 _FRAMES = 64
-"""Frames of a trial of numbers, and persons of a batch."""
+"""Frames in a trial of numbers, and persons in a batch."""
 _STEPS = 24
 """Frames of a motion."""
 
 
 def _many(draw: Draw) -> DrawTrial:
-    """64 frames; what the frame itself refuses, the pipeline never sees."""
+    """Draws trials of 64 frames; the pipeline never sees those that `SmplFrame` itself refuses."""
 
     def trial(rng: np.random.Generator) -> Trial:
         frames = []
@@ -38,7 +38,7 @@ def _many(draw: Draw) -> DrawTrial:
 
 
 def _calm(share: float, *, in_room: bool = False) -> DrawTrial:
-    """A share of an everyday pose, in which most bodies don't touch themselves; anywhere in a room or at its origin."""
+    """Draws scaled-down everyday poses, in which most bodies don't touch themselves, at the origin or in a room."""
 
     def trial(rng: np.random.Generator) -> Trial:
         pose, betas = share * everyday_pose(rng), rng.normal(0, 1, N_BETAS)
@@ -65,7 +65,7 @@ def _any_frame(rng: np.random.Generator) -> Trial:
 
 
 def _wide(rng: np.random.Generator) -> Trial:
-    """Half within the promised range, half anywhere."""
+    """Half of the trials are within the promised range, half anywhere."""
     return _promised(rng) if rng.random() < 0.5 else _any_frame(rng)
 
 
@@ -76,14 +76,14 @@ def _motion(rng: np.random.Generator) -> Trial:
 
 
 def _folding(rng: np.random.Generator) -> Trial:
-    """From an everyday pose to one with limbs through the trunk."""
+    """Motion from an everyday pose to one with limbs through the trunk."""
     last = FRAMES["limbs through the trunk"](rng)
     poses: list[NDArray[np.floating]] = [0.7 * everyday_pose(rng), last.pose]
     return Trial(tuple(frame_of(pose, last.betas) for pose in between(poses, _STEPS)))
 
 
 def _teleport(rng: np.random.Generator) -> Trial:
-    """Frames of which each is far from the last one."""
+    """Frames each of which is far from the one before."""
     names = ("everyday", "any rotation of any joint", "limbs through the trunk", "betas of 5", "angles beyond a turn")
     return Trial((*(FRAMES[name](rng) for name in rng.permutation(names)), everyday(rng)))
 
@@ -130,4 +130,4 @@ CHECKS: dict[str, Check] = {
         Check("invariance: a batch of 64, resolved", _crowd, invariance.batch_resolved, repeats=invariance.ALONE),
     )
 }
-"""By name; each round has all of them in this order."""
+"""All checks by name; each round runs them in this order."""

@@ -1,4 +1,4 @@
-"""Frames to try: those that people make, and those that only senders make."""
+"""Frames to try: those of real people, and those that only a faulty or hostile sender makes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
 from refu_core.realtime import PROMISED_BEND, PROMISED_POSES, PROMISED_SIZE, SPINE, spine_bend
 
 Draw = Callable[[np.random.Generator], SmplFrame]
-frame_of: Callable[..., SmplFrame] = SmplFrame  # of numbers of any kind, which it converts
+frame_of: Callable[..., SmplFrame] = SmplFrame  # typed loosely: it converts numbers of any kind
 
 _SPREAD: dict[str, float] = {
     **dict.fromkeys(("pelvis", "spine1", "spine2", "spine3", "neck", "head"), 0.12),
@@ -27,11 +27,11 @@ _SPREAD: dict[str, float] = {
 _SHOULDERS = (JOINT_NAMES.index("left_shoulder"), JOINT_NAMES.index("right_shoulder"))
 _HIPS = (JOINT_NAMES.index("left_hip"), JOINT_NAMES.index("right_hip"))
 _LIMBS = tuple(JOINT_NAMES.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("shoulder", "elbow"))
-_SERIES_SWITCH = 1e-2  # [rad]; where Rodrigues' formula goes over to its series
+_SERIES_SWITCH = 1e-2  # [rad]; below it, Rodrigues' formula is replaced by its series
 
 
 def everyday_pose(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Arms half lowered, all joints a little off that [rad], shape (24, 3)."""
+    """Arms half lowered and all joints randomly turned a little [rad], shape (24, 3)."""
     spread = np.array([_SPREAD.get(name.split("_")[-1], 0.0) for name in JOINT_NAMES])
     pose: NDArray[np.float64] = rng.normal(0, 1, (N_JOINTS, 3)) * spread[:, None]
     pose[_SHOULDERS, 2] += (-0.6, 0.6)
@@ -39,7 +39,7 @@ def everyday_pose(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def everyday(rng: np.random.Generator) -> SmplFrame:
-    """A person of any shape in an everyday pose, somewhere in a room; every other one with a style of their own."""
+    """A person of any shape in an everyday pose, somewhere in a room; every other one has a style."""
     return frame_of(
         everyday_pose(rng),
         betas=rng.normal(0, 1, N_BETAS),
@@ -49,14 +49,14 @@ def everyday(rng: np.random.Generator) -> SmplFrame:
 
 
 def _directions(rng: np.random.Generator, lengths: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Rotation vectors of these lengths (24,) in any direction, shape (24, 3)."""
+    """Rotation vectors of these lengths (24,) in random directions, shape (24, 3)."""
     axes = rng.normal(size=(N_JOINTS, 3))
     unit: NDArray[np.float64] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     return unit * lengths[:, None]
 
 
 def _one_of(*lengths: float, jitter: float = 0.0) -> Draw:
-    """All joints turned by one of these angles, give or take `jitter` [rad]."""
+    """Draws frames in which each joint turns by one of these angles, give or take `jitter` [rad]."""
 
     def draw(rng: np.random.Generator) -> SmplFrame:
         angles = rng.choice(lengths, N_JOINTS) + jitter * rng.normal(size=N_JOINTS)
@@ -66,7 +66,7 @@ def _one_of(*lengths: float, jitter: float = 0.0) -> Draw:
 
 
 def _wrapped(rng: np.random.Generator) -> SmplFrame:
-    """An everyday pose by other rotation vectors: each one turned once more, or the long way round."""
+    """An everyday pose by other rotation vectors: some with a full turn more or less."""
     pose = everyday_pose(rng)
     angle = np.maximum(np.linalg.norm(pose, axis=1, keepdims=True), 1e-6)
     turns = rng.choice((-1, 0, 1), (N_JOINTS, 1))
@@ -118,7 +118,7 @@ def _denormal(rng: np.random.Generator) -> SmplFrame:
 
 
 def _absurd(rng: np.random.Generator) -> SmplFrame:
-    """Finite float32 numbers of any size: to be refused, or survived."""
+    """A finite float32 number of any size somewhere in the frame: it has to be refused, or survived."""
     frame = everyday(rng)
     pose, betas, transl = np.array(frame.pose, np.float64), np.array(frame.betas, np.float64), np.array(frame.transl)
     target = (pose.reshape(-1), betas, transl)[rng.integers(3)]
@@ -127,11 +127,11 @@ def _absurd(rng: np.random.Generator) -> SmplFrame:
 
 
 def promised(rng: np.random.Generator) -> SmplFrame:
-    """A frame of the range that "nothing inside" is promised for: half of them far out in it, β at its corners."""
+    """A frame of the range that "nothing inside" is promised for; half of them have β at the corners of its range."""
     low, high = PROMISED_POSES
     pose = np.where(np.isfinite(low), rng.uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi)), 0.0)
     angle = np.linalg.norm(pose, axis=1, keepdims=True)
-    pose *= np.minimum(1.0, 3.0 / np.maximum(angle, 1e-9))  # beyond half a turn it were another vector
+    pose *= np.minimum(1.0, 3.0 / np.maximum(angle, 1e-9))  # beyond half a turn, a shorter vector is the same rotation
     pose *= rng.uniform(0.2, 1.0)
     while spine_bend(pose) > PROMISED_BEND:
         pose[SPINE] *= 0.9
@@ -157,12 +157,11 @@ FRAMES: Mapping[str, Draw] = {
     "limbs through the trunk": _self_penetrating,
     "absurd": _absurd,
 }
-"""Classes of frames, by name."""
+"""Kinds of frames, by name."""
 
 
 def between(poses: Sequence[NDArray[np.floating]], steps: int) -> list[NDArray[np.float64]]:
-    """From each pose (24, 3) [rad] to the next in `steps` on the shorter arc; starts with the first, ends before the
-    last."""
+    """Goes from each pose (24, 3) [rad] to the next in `steps` on the shorter arc, without the last pose itself."""
     motion = []
     for first, last in pairwise(poses):
         turns = [Slerp([0, 1], Rotation.from_rotvec(np.stack([first[j], last[j]]))) for j in range(N_JOINTS)]

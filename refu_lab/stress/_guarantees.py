@@ -23,24 +23,24 @@ from refu_lab.stress._subject import Subject
 from refu_lab.stress._trial import Measurement, Trial
 
 DEPTH = 1e-4
-"""No vertex is deeper inside the collider than this [m]."""
+"""No vertex may be deeper inside the collider than this [m]."""
 MULTIPLE = 2.0
-"""No vertex is moved farther than this multiple of what the deepest one near it lacks to the margin."""
+"""No vertex may move farther than this times the sum of the margin and the largest shortfall from it nearby."""
 REACH = 8
-"""How near [edges]: as far as pushed vertices and, after them, raised edges take others along."""
+"""What counts as nearby [edges]: as far as pushed vertices, and after them raised edges, take others along."""
 PACE = 2.0
-"""From frame to frame, no vertex moves by more than this multiple of the body's fastest vertex, plus `PACE_SLACK`."""
+"""From frame to frame, no vertex may move farther than this multiple of the body's fastest vertex plus `PACE_SLACK`."""
 PACE_SLACK = 1e-3
 """[m]."""
-_BOUND_SLACK = 1e-5  # [m]; rounding of a displacement that is drawn back to its bound
+_BOUND_SLACK = 1e-5  # [m]; rounding of a displacement that is clamped to its bound
 _ON_SKIN = 1e-5  # [m]
 _BURIED = 0.02  # [m]
 
 
 def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The depth of the deepest vertex, by winding number, where the frame promises it (`FrameStats.within_promise`).
+    """The depth of the deepest vertex, by winding number, where that is promised (`FrameStats.within_promise`).
 
-    Where it doesn't, since the body is deeper in itself than skin gives way, the frame has to say who is inside.
+    Where it isn't, as when the body overlaps itself deeper than skin gives way, the vertices inside have to be counted.
     """
     (out,) = subject.pipeline(trial.frames)
     if not out.stats.within_promise:
@@ -53,19 +53,19 @@ def nothing_inside(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def counted(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The certificate (`n_unresolved`) against the winding numbers of every vertex that came out, by garment."""
+    """Compares each garment's certificate (`n_unresolved`) with the winding numbers of all its output vertices."""
     (out,) = subject.pipeline(trial.frames)
     subject.checker.update(out.body)
     for name, mesh in out.items():
         found = subject.checker.check(mesh.local, mesh.faces)
-        # As the certificate is of the person unturned, what is on the skin itself may round to the other side.
+        # The certificate is computed before the person is turned, so vertices on the skin may round to its other side.
         n_sure, n_said = int((found.depth > _ON_SKIN).sum()), out.stats.garments[name].n_unresolved
         fault = f"{name}: {n_sure} vertices are inside, {n_said} are said to be"
         yield Measurement(nan=n_not_finite(mesh.vertices), faults=(fault,) if n_said < n_sure else ())
 
 
 def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The same, of garments whose every vertex starts 2 cm inside the body."""
+    """The depth of the deepest vertex of garments whose every vertex starts 2 cm inside the body."""
     frame, stage = trial.frames[0], subject.contact_stage
     skinned = {name: replace(one, backbone=Skinned()) for name, one in subject.pipeline.outfit.wearables.items()}
     pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
@@ -96,7 +96,7 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """How far vertices are moved off the body, against how far the deepest one near each is from the margin."""
+    """Compares how far vertices are moved off the body with how far short of the margin those near them are."""
     for name, pipeline in subject.one_by_one.items():
         (out,) = pipeline(trial.frames)
         mesh = out[name]
@@ -111,7 +111,7 @@ def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The largest displacement, from where limbs press the cloth, against `MAX_DISPLACEMENT`, whatever the frame."""
+    """Compares displacements from where limbs press the cloth with `MAX_DISPLACEMENT`, whatever the frame."""
     for name, pipeline in subject.one_by_one.items():
         (out,) = pipeline(trial.frames)
         moved = np.linalg.norm(out[name].local - out[name].raw, axis=1)
@@ -122,18 +122,18 @@ def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def no_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """How far vertices go from frame to frame, each garment worn alone, against the body's fastest vertex.
+    """Compares how far vertices go from frame to frame, each garment worn alone, with the body's fastest vertex.
 
-    What is pushed goes to the closest skin. That leaps where another way out becomes the shortest, from one side of a
-    limb's medial axis to the other, and no projection that remembers nothing can follow it smoothly: so vertices may go
-    as far, in addition, as the closest skin does of what is pushed near them.
+    Pushed vertices go to the closest skin. That leaps from one side of a limb's medial axis to the other where another
+    way out becomes the shortest, and no projection without memory can follow it smoothly. So vertices may go farther by
+    as much as the closest skin of pushed vertices near them moves.
     """
     for pipeline in subject.one_by_one.values():
         yield from _jumps(subject, pipeline, trial)
 
 
 def no_jumps_together(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The same of garments worn over each other, where the closest place of the sheet below may leap, too."""
+    """The same for garments worn over each other, where the closest point of the garment below may leap, too."""
     return _jumps(subject, subject.pipeline, trial)
 
 
@@ -151,7 +151,7 @@ def _jumps(subject: Subject, pipeline: GarmentPipeline, trial: Trial) -> Iterato
 
 
 def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """As limbs go through each other: from one bound of the displacement to the other, and no farther."""
+    """As limbs go through each other, vertices may go from one bound of the displacement to the other, no farther."""
     before: dict[str, NDArray[np.floating]] = {}
     for frame, (last, out) in zip(trial.frames, _pairs(subject.pipeline, trial), strict=True):
         yield _finite(out)
@@ -164,9 +164,9 @@ def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> dict[str, NDArray[np.floating]]:
-    """How far limbs press the vertices of each garment towards the skin that it lies on [m], (N,).
+    """How far limbs press the vertices of each garment towards the skin that they lie on [m], (N,).
 
-    Of garments worn `together`, how far unfolding them beforehand takes them as well.
+    For garments worn `together`, this includes how far they are unfolded beforehand.
     """
     stage, outfit = subject.contact_stage, subject.pipeline.outfit
     pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
@@ -184,7 +184,7 @@ def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> d
 
 
 def _pairs(pipeline: GarmentPipeline, trial: Trial) -> Iterator[tuple[Any, PipelineOutput]]:
-    """Each frame's output after that of the frame before it, which is None for the first."""
+    """Yields, for each frame, the previous frame's output (None at first) and its own."""
     last = None
     for frame in trial.frames:
         out = pipeline(frame)
@@ -193,7 +193,7 @@ def _pairs(pipeline: GarmentPipeline, trial: Trial) -> Iterator[tuple[Any, Pipel
 
 
 def _farthest(way: NDArray[np.floating], limit: NDArray[np.floating]) -> Measurement:
-    """Of the vertex that goes farthest on its way (N,) for its limit (N,) [m]."""
+    """Measures the vertex that moves farthest relative to its limit; `way` and `limit` are (N,) [m]."""
     i = int(np.argmax(way / limit))
     return Measurement(deviation=float(way[i]), limit=float(limit[i]))
 
@@ -204,20 +204,20 @@ def _finite(out: PipelineOutput) -> Measurement:
 
 @dataclass(frozen=True, eq=False)
 class _Aims:
-    """Where collision handling takes the N vertices of a garment: to the skin, and to the sheets worn below."""
+    """Where collision handling takes the N vertices of a garment: to the skin, and to the garments worn below."""
 
     places: list[NDArray[np.floating]]
     """The closest point of each surface to each vertex before collision handling [m], (N, 3)."""
     is_pushed: list[NDArray[np.bool_]]
-    """Whether a vertex is nearer to that surface than it may be, (N,)."""
+    """Whether each vertex is nearer to that surface than allowed, (N,)."""
 
 
 def _closest_skin(
     subject: Subject, out: PipelineOutput, mesh: GarmentMesh
 ) -> tuple[NDArray[np.float32], NDArray[np.floating]]:
-    """The skin closest to each vertex before collision handling [m], (N, 3), and what it lacks to the margin [m], (N,).
+    """The skin closest to each vertex before collision handling, (N, 3), and its shortfall from the margin, (N,) [m].
 
-    Where limbs overlap the closest skin may be inside: it is the closest that isn't.
+    Where limbs overlap, the closest skin may be inside the body; then the closest skin outside is taken.
     """
     raw, body = torch.tensor(mesh.raw), torch.tensor(out.body)
     sdf, stage = subject.distances["exact"], subject.contact_stage
@@ -250,7 +250,7 @@ def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> d
 
 
 def _above(points: NDArray[np.float32], sheet: GarmentMesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A garment's closest points to `points` [m], both (N, 3), and how high the latter are above it [m], (N,)."""
+    """The points of a garment closest to `points` [m], both (N, 3), and the height of `points` above it [m], (N,)."""
     surface = Surface(sheet.local.astype(np.float64), sheet.faces.astype(np.int32))
     found = surface.closest(points.astype(np.float64))
     closest = surface.at(found)
@@ -260,7 +260,7 @@ def _above(points: NDArray[np.float32], sheet: GarmentMesh) -> tuple[NDArray[np.
 
 
 def _leap(before: _Aims, now: _Aims, edges: NDArray[np.int64]) -> NDArray[np.floating]:
-    """How far, at most, the places go that vertices near each vertex are pushed to [m], (N,)."""
+    """Bounds, for each vertex, how far the targets of pushed vertices near it have moved [m], (N,)."""
     leap = np.zeros(len(now.is_pushed[0]), np.float32)
     for i, place in enumerate(now.places):
         way = np.linalg.norm(place - before.places[i], axis=1)

@@ -1,4 +1,4 @@
-"""Invariance: where the person stands, which way they face, who else is dressed and what came before."""
+"""Invariance to where a person stands and faces, to left and right, to who else is dressed, and to what came before."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from refu_lab.stress._subject import Subject, distance_to_mesh
 from refu_lab.stress._trial import Measurement, Trial
 
 RIGID = 1e-4
-"""How closely a garment follows the person [m]."""
+"""Largest deviation of a garment that has to follow its person [m]."""
 _FAR = 1e5  # [m]
 ALONE = 16
-"""Persons of a batch that are dressed alone, too."""
+"""Number of persons in a batch that are also dressed alone."""
 _UNDECIDED = 0.01
-"""Share of a garment's vertices whose way out may hang on a rounding."""
+"""Share of a garment's vertices whose way out may depend on rounding."""
 _MIRROR_POINTS = 32
 ASYMMETRY = 4e-3
-"""What collision handling may add to the asymmetry of body, garment and backbone [m]: as much as the margin."""
+"""What collision handling may add to the asymmetry of body, garment and backbone [m]; equal to the margin."""
 
 
 def turned(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The garment of a turned person against the turned garment.
+    """Compares the garment of a turned person with the turned garment.
 
-    Networks feel gravity, so that with them the person turns about the vertical; a skinned garment turns any way.
+    Networks know which way is down, so with them the person turns about the vertical only; with skinning, in any way.
     """
     rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
     is_skinned = subject.wardrobe.backbone == "skinned"
@@ -46,7 +46,7 @@ def turned(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def moved(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The garment of a person 100 km away against that of one at the origin."""
+    """Compares the garment of a person up to 100 km away along each axis with that of one at the origin."""
     rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
     transl = _FAR * rng.uniform(-1, 1, 3)
     here, there = subject.pipeline(frame), subject.pipeline(frame_of(frame.pose, betas=frame.betas, transl=transl))
@@ -55,10 +55,10 @@ def moved(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def mirrored(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The garment of the mirror image against the garment's mirror image, surface to surface.
+    """Compares the garment of the mirror image with the garment's mirror image, surface to surface.
 
-    Meshes and networks aren't quite symmetric; so the limit is what the garment is off before collisions are handled,
-    and what handling them may add.
+    Meshes and networks aren't quite symmetric, so the limit is the deviation before collision handling plus what that
+    may add.
     """
     rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
     here, there = subject.pipeline(frame), subject.pipeline(mirror_image(frame))
@@ -75,7 +75,7 @@ def mirrored(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def mirror_image(frame: SmplFrame) -> SmplFrame:
-    """The frame in a mirror at x = 0: left and right joints exchanged, rotations turned the other way."""
+    """The frame mirrored at x = 0: left and right joints exchanged, rotations mirrored."""
     return frame_of(
         frame.pose[MIRRORED_JOINTS,] * np.array((1, -1, -1), np.float32),
         frame.betas,
@@ -85,29 +85,29 @@ def mirror_image(frame: SmplFrame) -> SmplFrame:
 
 
 def history(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """A frame after others, each far from the last, against the same frame after itself: not a bit may differ."""
+    """Compares a frame after others, far from it, with the same frame after itself and in a new pipeline."""
     for frame in trial.frames[:-1]:
         subject.pipeline(frame)
     last = trial.frames[-1]
     after, again = subject.pipeline(last), subject.pipeline(last)
-    alone = subject.load()(last)  # a pipeline's first frame
+    alone = subject.load()(last)  # as the first frame of a new pipeline
     for other in (again, alone):
         for name, mesh in after.items():
             yield _apart(mesh.local, other[name].local, 1e-6)
 
 
 def batch(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """Persons dressed together against the same persons one by one, before collision handling."""
+    """Compares persons dressed together with the same persons one by one, before collision handling."""
     for alone, together in _alone_and_together(subject, trial):
         for name, mesh in alone.items():
             yield _apart(mesh.raw, together[name].raw, ROUNDING)
 
 
 def batch_resolved(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The same after collision handling, which has two ways out for some vertices: all but one in a hundred.
+    """The same after collision handling, for all but one vertex in a hundred: some have two ways out.
 
-    A product of matrices of 64 rows is rounded otherwise than one of a single row, and which way is shorter may hang on
-    that; a bound for every single vertex is that of displacements, which is a check of its own.
+    A matrix product of 64 rows is rounded differently from one of a single row, which may decide the shorter way. Every
+    single vertex is still subject to the bound of displacements, which has a check of its own.
     """
     for alone, together in _alone_and_together(subject, trial):
         for name, mesh in alone.items():
@@ -122,5 +122,5 @@ def _alone_and_together(subject: Subject, trial: Trial) -> Iterator[tuple[Pipeli
 
 
 def _apart(a: NDArray[np.floating], b: NDArray[np.floating], limit: float) -> Measurement:
-    """How far the farthest of N points (N, 3) is from where it should be."""
+    """The largest distance between N points (N, 3) and where they should be, with its limit [m]."""
     return Measurement(deviation=float(np.linalg.norm(a - b, axis=1).max()), limit=limit)

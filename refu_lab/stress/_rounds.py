@@ -1,4 +1,4 @@
-"""What `refu stress` does: all checks, round after round, until there are enough of them; the soaks; its table."""
+"""What `refu stress` does: runs all checks, round after round, and the soaks; prints the table."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from refu_lab.stress._trial import Check, Measurement, StressError, Tally, load_
 from refu_lab.tables import format_table
 
 _SOAK_SHARE = 0.3
-"""Of the time of a long run."""
+"""Share of a long run's time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StressResult:
-    """What came of all checks and soaks."""
+    """The results of all checks and soaks."""
 
     tallies: list[Tally] = field(default_factory=list)
     soaks: list[SoakResult] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     """What could not be tried, and why."""
     files: list[Path] = field(default_factory=list)
-    """The worst cases."""
+    """Files of the worst cases."""
 
     @property
     def _all(self) -> list[Tally | SoakResult]:
@@ -45,16 +45,16 @@ class StressResult:
 
     @property
     def failures(self) -> int:
-        """Trials, and tenths of soaks, that were beyond their limits."""
+        """Number of failed trials, and of limits that soaks exceeded."""
         return sum(row.failures for row in self._all)
 
     def as_dict(self) -> dict[str, Any]:
-        """Ready for JSON."""
+        """The results, ready for JSON."""
         return {"rows": [row.as_dict() for row in self._all], "left_out": self.left_out, "failures": self.failures}
 
 
 def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
-    """Tries all that was asked for.
+    """Runs everything that the options ask for.
 
     Raises:
         StressError: there is nothing to try: no such part, or no weights of any garment.
@@ -88,7 +88,7 @@ def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
 
 
 def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
-    """What is worn in each mode, a wardrobe a body; and what isn't, for want of weights."""
+    """A wardrobe for each mode and body; and the garments that are left out for lack of weights."""
     worn: dict[tuple[str, str, str], list[str]] = {}
     left_out = []
     for backbone, sdf in options.modes:
@@ -108,9 +108,9 @@ def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
 def _run_checks(
     options: StressOptions, pairs: Sequence[tuple[Check, Subject]], seconds: float, *, progress: bool
 ) -> list[Tally]:
-    """Tries all, whole rounds first, then until the time is over; one tally a check and mode, in the checks' order.
+    """Runs `n_rounds` whole rounds, then goes on until the time is over; one tally a check and mode, in their order.
 
-    What is drawn depends on the seed, the check and the round alone.
+    What is drawn depends only on the seed, the check, its garments and the round.
     """
     tallies: dict[tuple[str, str], Tally] = {}
     total = options.n_rounds * len(pairs) if options.hours is None else None
@@ -140,10 +140,10 @@ def _save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:
 
 
 def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = True) -> Tally:
-    """Tries again what `refu stress` has written.
+    """Runs a trial again that `refu stress` has saved.
 
     Raises:
-        StressError: the file can't be read, or is of a check that there isn't.
+        StressError: the file can't be read, or its check doesn't exist.
         RefuError: as `GarmentPipeline.load`.
     """
     name, wardrobe, trial = load_trial(path)
@@ -157,7 +157,7 @@ def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = Tr
 
 
 def stress_table(result: StressResult) -> str:
-    """All rows, faults, and where the worst cases are."""
+    """What `refu stress` prints: all rows, the faults, and where the worst cases are."""
     lines = []
     if result.tallies:
         rows = []
@@ -204,7 +204,7 @@ def _first_last(form: str, tenths: tuple[float, ...]) -> str:
 
 
 def length(metres: float) -> str:
-    """A length with the unit that suits it."""
+    """A length as text, in a unit that suits it."""
     if not math.isfinite(metres):
         return "-"
     for scale, unit in ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm")):

@@ -1,4 +1,4 @@
-"""Soak: whether the pipeline grows or slows down as frames go by."""
+"""Soak: whether the pipeline's memory grows, or it slows down, as frames go by."""
 
 from __future__ import annotations
 
@@ -21,55 +21,55 @@ from refu_lab.stress._numbers import n_not_finite
 from refu_lab.stress._trial import StressError
 
 TOLERANCE = 0.05
-"""By how much the last tenth may exceed the first one."""
+"""Share by which the last tenth may exceed the first one."""
 JUDGED_FROM = 20_000
-"""Calls from which the 99th percentiles of a tenth are judged: of less they are the luck of a few frames."""
+"""Calls from which on 99th percentiles are judged: with fewer, those of a tenth depend on the luck of a few frames."""
 _POSES = 8
 _STEPS = 25
 _FEWEST = 10
 _YARDSTICK = 192
-"""Size of the matrix that the yardstick multiplies: a fifth of a millisecond."""
+"""Size of the matrix that the yardstick multiplies, which takes a fifth of a millisecond."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SoakResult:
-    """The first tenth of many frames against the last one."""
+    """The tenths of a long run, of which the last is compared with the first."""
 
     mode: str
     frames: int
     """Persons dressed."""
     persons: int
-    """In one call."""
+    """Persons in one call."""
     nan: int
-    """Numbers that came out and aren't finite."""
+    """Numbers in the output that aren't finite."""
     seconds: float
     tenths_mb: tuple[float, ...]
-    """Largest resident memory of each tenth."""
+    """Largest resident memory in each tenth [MB]."""
     tenths_ms: tuple[float, ...]
     """99th percentile of a call's processor time in each tenth [ms]."""
     tenths_wall_ms: tuple[float, ...]
-    """The same of its wall time, which other processes lengthen [ms]."""
+    """The same for wall time, which other processes lengthen [ms]."""
     tenths_yardstick_ms: tuple[float, ...]
-    """The same of the processor time of work that is always the same [ms]."""
+    """The same for the processor time of the yardstick, which always does the same work [ms]."""
 
     @property
     def growth(self) -> float:
-        """Of the memory, as a share of the first tenth's."""
+        """Growth of the memory, as a share of the first tenth's."""
         return _growth(self.tenths_mb)
 
     @property
     def slowdown(self) -> float:
-        """Of the processor time's 99th percentile, likewise."""
+        """Growth of the processor time's 99th percentile, likewise."""
         return _growth(self.tenths_ms)
 
     @property
     def machine_slowdown(self) -> float:
-        """Of the yardstick, likewise: how much slower the machine itself has become."""
+        """Growth of the yardstick's time, likewise: how much slower the machine itself has become."""
         return _growth(self.tenths_yardstick_ms)
 
     @property
     def failures(self) -> int:
-        """How many have failed of memory, latency (of many calls, by the clock and by the yardstick) and numbers."""
+        """How many of these failed: memory, latency (given enough calls, by clock and by yardstick), numbers."""
         times, is_judged = 1 + self.slowdown, self.frames >= JUDGED_FROM * self.persons
         slower = is_judged and is_slower(times, times, 1 + self.machine_slowdown)
         return (self.growth > TOLERANCE) + slower + (self.nan > 0)
@@ -83,7 +83,7 @@ class SoakResult:
 
 
 def soak_frames(rng: np.random.Generator) -> list[SmplFrame]:
-    """A motion of 200 frames whose end joins its beginning, on one body."""
+    """A motion of 200 frames that can be looped, on one body."""
     poses: list[NDArray[np.floating]] = [everyday_pose(rng) for _ in range(_POSES)]
     betas = rng.normal(0, 1, 10)
     return [frame_of(pose, betas=betas) for pose in between([*poses, poses[0]], _STEPS)]
@@ -99,22 +99,22 @@ def soak(
     seed: int = 0,
     tick: Callable[[int], object] = int,
 ) -> SoakResult:
-    """Runs the same motions over and over, until `frames` or `seconds` are over, and compares the tenths.
+    """Runs the same motions over and over, until `frames` or `seconds` are reached, and measures each tenth of the run.
 
-    Each of the `persons` of a call has a motion of their own and is a frame; `tick` is called with how many are done.
-    After an interrupt (Ctrl-C) the tenths are those so far.
+    Each of the `persons` in a call has their own motion and counts as a frame; `tick` is called with the number of
+    frames after each call. After an interrupt (Ctrl-C) the tenths are those of the run so far.
 
     Raises:
-        StressError: fewer than ten calls, which have no tenths.
+        StressError: `frames` give fewer than ten calls, which have no tenths.
     """
     calls = -(-frames // persons)
     if calls < _FEWEST:
         msg = f"a soak needs {_FEWEST} frames or more of each person, got {calls}"
         raise StressError(msg)
     steps = list(zip(*(soak_frames(np.random.default_rng(seed + i)) for i in range(persons)), strict=True))
-    for step in steps:  # what is made in the first frames of all is no growth
+    for step in steps:  # what the very first frames allocate isn't growth
         pipeline(step)
-    log = np.ones((4, calls), np.float32)  # touched now: it mustn't look like the pipeline's growth
+    log = np.ones((4, calls), np.float32)  # ones, so that its memory is touched now and doesn't look like growth
     yardstick, nan, n = Yardstick(), 0, 0
     start = time.perf_counter()
     with contextlib.suppress(KeyboardInterrupt):
@@ -143,7 +143,7 @@ def soak(
 
 
 class Yardstick:
-    """Work that is always the same: it takes longer when the machine does, and not when something leaks."""
+    """Work that is always the same: it takes longer when the machine slows down, but not when something leaks."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
@@ -151,23 +151,23 @@ class Yardstick:
         self._rows = rng.integers(_YARDSTICK, size=8 * _YARDSTICK)
 
     def measure(self) -> float:
-        """Its processor time now [ms]."""
+        """Does the work once; returns its processor time [ms]."""
         before = time.thread_time()
         (self._matrix @ self._matrix)[self._rows].sum()
         return 1e3 * (time.thread_time() - before)
 
 
 def resident_mb(process: int | str = "self") -> float:
-    """Resident memory of a process [MB]; raises `OSError` where there is none of that number."""
+    """Resident memory of a process [MB]; raises `OSError` if there is no such process."""
     pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
     return pages * resource.getpagesize() / 1e6
 
 
 def is_slower(later: float, longer: float, machine: float) -> bool:
-    """Whether answers come `later` times as late, and take `longer` times as long to compute, than may be.
+    """Whether answers that come `later` times as late, and take `longer` times as long to compute, are too slow.
 
-    `machine` is how many times as long the yardstick takes: what the machine has slowed down itself isn't held against
-    anybody. Lateness alone is what any other process does that wants the processor.
+    `machine` is how many times as long the yardstick takes: a slower machine isn't held against the pipeline. Nor is
+    lateness alone, which any other process that needs the processor can cause.
     """
     return min(later, longer / machine) > 1 + TOLERANCE
 

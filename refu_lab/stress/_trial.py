@@ -1,4 +1,4 @@
-"""What is tried, what came of it, and how a worst case is kept so that it can be tried again."""
+"""Trials and their measurements, and how a worst case is saved so that it can be tried again."""
 
 from __future__ import annotations
 
@@ -20,42 +20,42 @@ _KEYS = ("check", "garments", "backbone", "sdf", "pose", "betas", "transl", "sty
 
 
 class StressError(RefuError, ValueError):
-    """Nothing to try, or a file of a trial that can't be read."""
+    """There is nothing to try, or a trial's file can't be read."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """All that a check needs to be repeated."""
+    """Everything needed to repeat a check."""
 
     frames: tuple[SmplFrame, ...]
     seed: int = 0
-    """Of whatever else the check draws."""
+    """Seed of whatever else the check draws."""
     refused: int = 0
-    """Frames that were drawn, and that `SmplFrame` itself refused."""
+    """Number of frames that were drawn but refused by `SmplFrame` itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """What one trial showed, or a part of it."""
+    """What one trial, or a part of it, showed."""
 
     runs: int = 1
     """Frames tried."""
     refused: int = 0
-    """Of these, refused with an error that says why."""
+    """How many of them were refused with an error that says why."""
     nan: int = 0
-    """Numbers that came out and aren't finite."""
+    """Numbers in the output that aren't finite."""
     deviation: float = 0.0
-    """From what should have come out [m]."""
+    """Deviation from the right output [m]."""
     limit: float = math.inf
-    """The largest deviation that is right [m], above zero."""
+    """The largest acceptable deviation [m], above zero."""
     faults: tuple[str, ...] = ()
     """What else went wrong."""
     culprit: int | None = None
-    """The frame that all this is of, where one alone would show it."""
+    """Index of the frame that showed this, if that frame alone reproduces it."""
 
     @property
     def badness(self) -> float:
-        """How near this is to failing: 1 is at the limit."""
+        """How close this is to failing: 1 is at the limit."""
         if self.faults or self.nan or math.isnan(self.deviation):
             return math.inf
         return self.deviation / self.limit
@@ -68,37 +68,37 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Check:
-    """One way in which something may go wrong, and how that would be noticed."""
+    """One way in which something may go wrong, and how to notice it."""
 
     name: str
     """`<part>: <what is tried>`."""
     draw: Callable[[np.random.Generator], Trial]
     measure: Callable[[Subject, Trial], Iterator[Measurement]]
-    """Yields what it finds, part by part: the worst of it counts."""
+    """Yields what it finds, part by part; the worst part counts."""
     trials: int = 1
-    """In one round."""
+    """Trials in one round."""
     repeats: int = 0
-    """Frames that a trial runs besides those that were drawn."""
+    """Frames that a trial runs in addition to those drawn."""
     sdf_modes: tuple[str, ...] = ()
-    """The modes that promise it; empty for all."""
+    """Modes that promise it; empty for all."""
 
     @property
     def part(self) -> str:
-        """Numbers, guarantees or invariance."""
+        """The part it belongs to: numbers, guarantees or invariance."""
         return self.name.partition(":")[0]
 
     def holds_for(self, wardrobe: Wardrobe) -> bool:
-        """Whether this mode promises it."""
+        """Whether the wardrobe's mode promises it."""
         return not self.sdf_modes or wardrobe.sdf in self.sdf_modes
 
     def run(self, subject: Subject, trial: Trial) -> Measurement:
-        """Measures; a refusal is counted, any other error is a failure."""
+        """Measures a trial; a refusal is counted, any other error is a failure."""
         n = len(trial.frames) + trial.refused
         try:
             found = list(self.measure(subject, trial)) if trial.frames else []
         except RefuError as error:
             return Measurement(runs=n, refused=n) if str(error) else Measurement(runs=n, faults=("refused in silence",))
-        except Exception as error:  # whatever it is, it should have been a RefuError
+        except Exception as error:  # any other error is a bug
             return Measurement(runs=n, faults=(f"{type(error).__name__}: {error}",))
         if not found:
             return Measurement(runs=n, refused=n)
@@ -113,7 +113,7 @@ class Check:
 
 @dataclass(eq=False)
 class Tally:
-    """What all trials of a check in one mode showed together."""
+    """What all trials of a check in one mode showed."""
 
     case: str
     mode: str
@@ -122,13 +122,13 @@ class Tally:
     failures: int = 0
     nan: int = 0
     max_deviation: float = 0.0
-    """Of all trials [m]: where the limit depends on the frame, not always that of the worst one."""
+    """Largest deviation of all trials [m]. If limits depend on the frame, it isn't always that of the worst trial."""
     faults: list[str] = field(default_factory=list)
     """The first few."""
     worst: Measurement | None = None
-    """Of the worst trial,"""
+    """What the worst trial showed."""
     worst_trial: tuple[Wardrobe, Trial] | None = None
-    """and this trial."""
+    """The worst trial, and what was worn in it."""
 
     def add(self, wardrobe: Wardrobe, trial: Trial, measured: Measurement) -> None:
         """Counts a trial."""
@@ -146,7 +146,7 @@ class Tally:
             self.worst, self.worst_trial = measured, (wardrobe, trial)
 
     def as_dict(self) -> dict[str, Any]:
-        """A row of the results, ready for JSON; lengths in metres, None for those that aren't finite."""
+        """A row of the results, ready for JSON; lengths are in metres, None if they aren't finite."""
         worst = self.worst or Measurement()
         figures = {"deviation_m": worst.deviation, "limit_m": worst.limit, "worst_share_of_limit": worst.badness}
         return {
@@ -163,7 +163,7 @@ class Tally:
 
 
 def save_trial(path: Path, check: str, wardrobe: Wardrobe, trial: Trial) -> Path:
-    """Writes a trial as `path`, an npz that `load_trial` reads."""
+    """Writes a trial to `path`, an npz that `load_trial` reads."""
     frames = trial.frames
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
@@ -184,7 +184,7 @@ def save_trial(path: Path, check: str, wardrobe: Wardrobe, trial: Trial) -> Path
 
 
 def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
-    """The check's name, the mode and the trial of a file that `save_trial` wrote.
+    """The check's name, the wardrobe and the trial in a file that `save_trial` wrote.
 
     Raises:
         StressError: the file is missing, damaged or something else.

@@ -1,4 +1,4 @@
-"""A film of recorded motion that is dressed while one looks."""
+"""A film of recorded motion that is dressed while you look."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from refu_lab.commands.replay import RecordingOptions
 
 _AWAY_S = 0.25
-"""Somebody whose nearest frame is farther off in time isn't there [s]."""
+"""A person whose nearest frame is farther off in time isn't shown [s]."""
 _USUAL = "smpl_params"
 
 
@@ -41,19 +41,19 @@ class PersonMotion:
     person: str
     frames: list[SmplFrame]
     times: NDArray[np.float64]
-    """[s], shape (T,), rising."""
+    """Times of the frames [s], shape (T,), in rising order."""
     turn: NDArray[np.float64]
-    """From its axes to z up, shape (3, 3)."""
+    """Rotation from the frames' axes to z up, shape (3, 3)."""
 
     def at(self, moment: float) -> SmplFrame | None:
-        """The frame nearest to a time [s]; None where none is near."""
+        """The frame nearest to a time [s]; None if none is near."""
         after = int(np.searchsorted(self.times, moment))
         index = min((max(after - 1, 0), min(after, len(self.times) - 1)), key=lambda i: abs(self.times[i] - moment))
         return self.frames[index] if abs(self.times[index] - moment) <= _AWAY_S else None
 
 
 class DressedFilm:
-    """People in files of motion and bags of SMPL parameters, in garments that can be changed.
+    """People from motion files and bags of SMPL parameters, in garments that can be changed.
 
     Raises `RefuError` for inputs that can't be read, and options that make no pipeline.
     """
@@ -61,9 +61,9 @@ class DressedFilm:
     def __init__(self, inputs: Sequence[Path], options: RecordingOptions) -> None:
         self._options = options
         self._pipeline = options.load_pipeline()
-        self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: who draws it compares identities
+        self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: drawing compares identities
         self.notes: list[str] = []
-        """What there is to warn of, for people."""
+        """Warnings for the user."""
         names = _different([path.stem for path in inputs]) if len(inputs) > 1 else [""]
         self._tracks = [track for path, name in zip(inputs, names, strict=True) for track in self._read(path, name)]
         longest = max(self._tracks, key=lambda track: len(track.frames))
@@ -75,7 +75,7 @@ class DressedFilm:
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """Of the person of most frames, from the first on [s], shape (T,)."""
+        """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
         times: NDArray[np.float64] = self._moments - self._moments[0]
         return times
 
@@ -88,25 +88,25 @@ class DressedFilm:
 
     @property
     def garments(self) -> tuple[str, ...]:
-        """What is worn."""
+        """Names of the garments worn."""
         return tuple(self._pipeline.garments)
 
     @property
     def sdf(self) -> str:
-        """How collisions are found."""
+        """The signed distance that finds collisions."""
         return str(self._options.sdf)
 
     @property
     def wardrobe(self) -> tuple[str, ...]:
-        """Garments that can be worn: those of this body and, where one was named, all."""
+        """Garments that can be worn: those made for this body or, if a body was named, all built-in ones."""
         if self._options.body:
             return BUILTIN_GARMENTS
         fitting = [name for name in BUILTIN_GARMENTS if load_garment(name).body == self._pipeline.body.name]
         return tuple(dict.fromkeys((*fitting, *self.garments)))
 
     def wear(self, garments: Sequence[str], sdf: str) -> None:
-        """Other garments, another signed distance. Raises `RefuError`, and nothing has changed then."""
-        paths = dict(zip(self.garments, self._options.garments, strict=False))  # those that were given as files
+        """Changes the garments and the signed distance. Raises `RefuError` and then changes nothing."""
+        paths = dict(zip(self.garments, self._options.garments, strict=False))  # some were given as files
         names = tuple(paths.get(name, name) for name in garments)
         options = replace(self._options, garments=names, sdf=sdf)
         self._pipeline, self._options = options.load_pipeline(), options
@@ -115,11 +115,11 @@ class DressedFilm:
         self._facts.clear()
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
-        """Everybody in a frame, dressed. Raises `RefuError`."""
+        """All persons in a frame, dressed. Raises `RefuError`."""
         return self._cache.get(index, self._dress)
 
     def facts(self, index: int) -> list[str]:
-        """What collision handling says of a frame, and how long it took."""
+        """What collision handling reports of a frame, and how long it took."""
         return self._facts.get(index, [])
 
     def _dress(self, index: int) -> Sequence[SceneMesh]:
@@ -156,14 +156,14 @@ class DressedFilm:
         return shapes
 
     def _read(self, path: Path, name: str) -> list[PersonMotion]:
-        """Everybody in a file, who is called `name` where there are other files."""
+        """All persons in a file; their names begin with `name`, which is empty for a single file."""
         options = replace(self._options, input=path)
         topics = _topics_of_people(path) if options.topic is None and options.input_type is None else []
         found = {name: self._frames(options)} if len(topics) < 2 else {}
         for topic in topics if len(topics) > 1 else ():
             person = topic.strip("/").removesuffix(_USUAL).rstrip("/") or "person"
             found[f"{name}/{person}" if name else person] = self._frames(replace(options, topic=topic))
-        start = min(frames[0].stamp_ns for frames in found.values())  # of several files, each begins at zero
+        start = min(frames[0].stamp_ns for frames in found.values())  # each file begins at zero
         tracks = []
         for person, frames in found.items():
             times = np.array([1e-9 * (frame.stamp_ns - start) for frame in frames])
@@ -171,9 +171,9 @@ class DressedFilm:
         return tracks
 
     def _frames(self, options: RecordingOptions) -> list[SmplFrame]:
-        """In the order of their stamps, one at least."""
+        """At least one frame, in the order of their stamps."""
         source = open_source(options, lambda: self._pipeline.body)
-        source.history = PoseHistory()  # other garments may heed it
+        source.history = PoseHistory()  # garments that are put on later may heed it
         records, frames = list(source.records), []
         for record in records:
             with suppress(RefuError):
@@ -189,12 +189,12 @@ class DressedFilm:
 
 
 def _different(names: Sequence[str]) -> list[str]:
-    """The names; those that were there already get numbers."""
+    """The names, with numbers added to those that occur again."""
     return [f"{name}-{k}" if (k := names[:i].count(name) + 1) > 1 else name for i, name in enumerate(names)]
 
 
 def _topics_of_people(path: Path) -> list[str]:
-    """Topics of several people: `<person>/smpl_params`."""
+    """A bag's topics of persons: `<person>/smpl_params`."""
     if path.suffix.lower() in SUFFIXES:
         return []
     with adapters.BagReader(path) as reader:
@@ -208,7 +208,7 @@ def _topics_of_people(path: Path) -> list[str]:
 
 
 def _turn(options: RecordingOptions, frames: Sequence[SmplFrame]) -> NDArray[np.float64]:
-    """From the axes of frames to z up: the permutation of markers, of people who stand."""
+    """Rotation from the frames' axes to z up, as for markers; with axes `frame`, people are turned upright first."""
     to_ros = np.roll(np.eye(3), 1, axis=0)
     if options.axes != "frame":
         return to_ros

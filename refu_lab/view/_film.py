@@ -1,4 +1,4 @@
-"""What a viewer shows: shapes at times, whoever makes them."""
+"""What a viewer shows: shapes at times, from any source."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class SceneMesh:
     """A mesh of one person in one frame."""
 
     name: str
-    """Of the garment, or `BODY` or `SKIN`."""
+    """Name of the garment, or `BODY` or `SKIN`."""
     person: str
-    """Empty where there is one person."""
+    """Name of the person; empty if there is only one."""
     vertices: NDArray[np.float32]
-    """[m], shape (V, 3): z up, from an origin that stays, so that whoever is far off keeps precision."""
+    """[m], shape (V, 3): z up, relative to a fixed origin near the people, so that precision isn't lost."""
     faces: NDArray[np.int64]
     """Counter-clockwise from outside, shape (F, 3)."""
     color: tuple[float, float, float]
@@ -32,7 +32,7 @@ class SceneMesh:
 
     @property
     def is_garment(self) -> bool:
-        """Whether somebody wears it."""
+        """Whether it is a garment."""
         return self.name not in (BODY, SKIN)
 
 
@@ -41,32 +41,32 @@ class Film(Protocol):
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """When each frame was, from the first on [s], shape (T,), T > 0."""
+        """Time of each frame, from the first one on [s], shape (T,), T > 0."""
 
     @property
     def title(self) -> str:
-        """What is shown, for people."""
+        """What is shown, as a title for the user."""
 
     @property
     def front(self) -> float:
         """Where the first person faces at the beginning: the angle from x towards y [rad]."""
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
-        """Everything in a frame; somebody who isn't there has no shapes. Raises `RefuError`."""
+        """Everything in a frame; a person who isn't there has no shapes. Raises `RefuError`."""
 
     def facts(self, index: int) -> list[str]:
-        """What there is to say of a frame, a line each."""
+        """Facts about a frame, one a line."""
 
 
 class Cache:
-    """The shapes of frames that were made last, up to half a gigabyte of vertices."""
+    """Keeps the shapes of the frames used last, up to half a gigabyte of vertices."""
 
     def __init__(self) -> None:
         self._shapes: OrderedDict[int, Sequence[SceneMesh]] = OrderedDict()
         self._bytes = 0
 
     def get(self, index: int, make: Callable[[int], Sequence[SceneMesh]]) -> Sequence[SceneMesh]:
-        """Those of a frame, made unless they are known."""
+        """The shapes of a frame, made if they aren't kept."""
         found = self._shapes.get(index)
         if found is None:
             found = self._shapes[index] = make(index)
@@ -77,7 +77,7 @@ class Cache:
         return found
 
     def clear(self) -> None:
-        """Forgets all."""
+        """Forgets all shapes."""
         self._shapes.clear()
         self._bytes = 0
 

@@ -1,4 +1,4 @@
-"""A film that isn't over: what a running node publishes, the newest of it."""
+"""A live film: the newest that a running node publishes."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from refu_lab.view._markers import MarkerScene
 
 TOPICS = ("garments", "body")
 _LOOK_S = 0.2
-"""How often who waits for the first garments looks whether it is to end [s]."""
+"""While waiting for the first garments, how often to check whether to end [s]."""
 _TOGETHER_S = 2.0
-"""How long after the first topic the others are waited for [s]."""
+"""How long to wait for the other topics after the first [s]."""
 
 
 class LiveFilm:
-    """Garments and bodies of marker topics; `wait` before it is shown, `close` it afterwards.
+    """Garments and bodies of marker topics; call `wait` before it is shown, and `close` afterwards.
 
-    Raises `RefuError` where rclpy isn't there, and for names that no topic has.
+    Raises `RefuError` if rclpy isn't there, and for names that no topic can have.
     """
 
     def __init__(self, topics: Sequence[str] = TOPICS) -> None:
@@ -34,7 +34,7 @@ class LiveFilm:
         self.notes: list[str] = []
         self.front = 0.0
         self.told: Callable[[], object] = lambda: None
-        """Called, from another thread, when there is something new."""
+        """Called from another thread when there is something new."""
         self._changed = threading.Condition()
         self._scene: MarkerScene[SceneMesh] = MarkerScene(lambda shape: shape)
         self._stamp_ns = self._n_frames = self._n_bad = 0
@@ -44,28 +44,28 @@ class LiveFilm:
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """There is no moment but this one."""
+        """The only moment is now."""
         return np.zeros(1)
 
     def wait(self, until: Callable[[], bool]) -> bool:
-        """For the first meshes, of all topics if they come soon; whether they have come before it was to end."""
+        """Waits for the first meshes, of all topics if they come soon; returns whether any came before `until` held."""
         with self._changed:
             while not self._is_here() and not until():
                 self._changed.wait(_LOOK_S)
             return bool(self._scene.topics)
 
     def _is_here(self) -> bool:
-        """Whether there is something to see: the ground is put under the first of it, so feet are waited for."""
+        """Whether there is enough to show: the ground is put under the first shapes, so feet are waited for."""
         is_late = self._since is not None and time.monotonic() > self._since + _TOGETHER_S
         return bool(self._scene.topics) and (is_late or self._scene.topics == self._heard)
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:  # noqa: ARG002
-        """What was published last of each topic; nothing of who has left."""
+        """What each topic published last, without meshes that are gone."""
         with self._changed:
             return self._scene.shown(time.monotonic_ns())
 
     def facts(self, index: int) -> list[str]:  # noqa: ARG002
-        """How it goes."""
+        """Stamp, rate and number of the meshes received."""
         with self._changed:
             passed = time.monotonic() - (self._since or time.monotonic())
             rate = f"{self._n_frames / passed:.0f} Hz" if passed > 1 else "…"
@@ -77,7 +77,7 @@ class LiveFilm:
             ]
 
     def close(self) -> None:
-        """Hears no more."""
+        """Stops listening."""
         self._topics.close()
 
     def _take(self, topic: str, data: bytes) -> None:

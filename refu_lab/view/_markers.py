@@ -1,4 +1,4 @@
-"""What markers show: meshes that stay until they are taken away, seen from an origin that stays."""
+"""What markers show: meshes that stay until they are deleted or expire, relative to a fixed origin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from msg_adapters.markers import ADD, DELETE, DELETE_ALL, TRIANGLE_LIST
 from refu_lab.view._film import SceneMesh
 
 _FARTHEST = 1e6
-"""A marker that is farther off is no thing to look at [m]."""
+"""Markers with coordinates beyond this aren't drawn [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,29 +23,29 @@ class Topology:
     """How the corners of a marker's triangles share vertices."""
 
     first: NDArray[np.intp]
-    """A corner of each vertex, shape (V,)."""
+    """Index of one corner at each vertex, shape (V,)."""
     faces: NDArray[np.int64]
     """Shape (F, 3)."""
 
     @classmethod
     def of(cls, points: NDArray[np.float64]) -> Topology:
-        """Of corners [m], shape (3F, 3): those in one place are one vertex."""
+        """The topology of corners [m], shape (3F, 3): those at the same position are one vertex."""
         rows = np.ascontiguousarray(points).view([("", points.dtype)] * 3).ravel()
         _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
         return cls(first, inverse.reshape(-1, 3).astype(np.int64))
 
     def fits(self, points: NDArray[np.float64]) -> bool:
-        """Whether corners, shape (3F, 3), share their vertices in this way."""
+        """Whether corners, shape (3F, 3), share vertices in this way."""
         return len(points) == self.faces.size and np.array_equal(points[self.first][self.faces.reshape(-1)], points)
 
 
 def is_mesh(marker: Marker) -> bool:
-    """Whether it shows triangles."""
+    """Whether a marker shows triangles."""
     return marker.type == TRIANGLE_LIST and marker.action == ADD and len(marker.points) > 0
 
 
 def is_drawable(marker: Marker) -> bool:
-    """Whether that can be done: with three corners a triangle, and no number that isn't one."""
+    """Whether its triangles can be drawn: three corners each, and numbers that are finite and not too large."""
     numbers = np.array([*marker.pose, *marker.scale])
     if len(marker.points) % 3 or not (np.abs(numbers) < _FARTHEST).all():
         return False
@@ -56,13 +56,13 @@ _Kept = TypeVar("_Kept")
 
 
 class MarkerScene(Generic[_Kept]):
-    """What is there of markers that come, of several topics: each stays until it is deleted, or its time is over.
+    """The markers of several topics that are on show: each stays until it is deleted, or its lifetime is over.
 
-    What doesn't change from marker to marker stays one array, and the first vertex of all is the origin.
+    Faces that don't change from message to message stay the same array. The very first vertex is the origin.
     """
 
     def __init__(self, keep: Callable[[SceneMesh], _Kept]) -> None:
-        """What is kept of a shape is up to `keep`."""
+        """`keep` turns each shape into what is kept of it."""
         self._keep = keep
         self._shown: dict[tuple[str, str, int], tuple[_Kept, float]] = {}
         self._origin: NDArray[np.float64] | None = None
@@ -70,18 +70,18 @@ class MarkerScene(Generic[_Kept]):
 
     @property
     def topics(self) -> set[str]:
-        """Those of which there is something."""
+        """Topics that have something on show."""
         return {topic for topic, *_ in self._shown}
 
     def shown(self, now_ns: float) -> list[_Kept]:
-        """What is there at a time of the receiver [ns]; the rest is forgotten."""
+        """What is on show at a time by the receiver's clock [ns]; the rest is forgotten."""
         self._shown = {key: one for key, one in self._shown.items() if now_ns < one[1]}
         return [kept for kept, _ in self._shown.values()]
 
     def take(self, topic: str, data: bytes, now_ns: int) -> tuple[int, int]:
-        """A message's markers: its stamp, 0 where it shows no mesh, and how many meshes can't be drawn.
+        """Takes in a message's markers; returns its stamp (0 if it shows no mesh) and how many meshes can't be drawn.
 
-        Raises `DecodeError` for what is no message of markers.
+        Raises `DecodeError` if it isn't a message of markers.
         """
         markers = decode_marker_array(data)
         for marker in markers:
@@ -97,7 +97,7 @@ class MarkerScene(Generic[_Kept]):
         return max((marker.stamp_ns or now_ns for marker in drawable), default=0), len(meshes) - len(drawable)
 
     def shape(self, marker: Marker) -> SceneMesh:
-        """A marker of triangles as a shape."""
+        """The shape of a marker of triangles."""
         key, points = (marker.ns, marker.id), marker.points
         topology = self._topologies.get(key)
         if topology is None or not topology.fits(points):

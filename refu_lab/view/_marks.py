@@ -1,4 +1,4 @@
-"""Colours that say something: what collides, and how far cloth is from the skin."""
+"""Colours with a meaning: what collides, and how far cloth is from the skin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Marking(Choice):
     CLOTH = "cloth"
     """Their own colours."""
     COLLISIONS = "collisions"
-    """The same, and what collides with the body is red: exactly checked."""
+    """The same, but faces that collide with the body, by an exact check, are red."""
     CLEARANCE = "clearance"
     """Distance to the body."""
 
@@ -38,13 +38,13 @@ CLEARANCE: tuple[tuple[float, Colour], ...] = (
     (0.050, (0.70, 0.84, 0.26)),
     (np.inf, (0.99, 0.91, 0.30)),
 )
-"""Bands of distance to the body: up to how far [m], and the colour. Nothing says which of two neighbours is farther off
-where a scale is smooth; a margin of 4 mm lies in the middle of a band."""
+"""Bands of distance to the body: each band's upper limit [m] and colour. On a smooth scale nobody could tell which of
+two neighbours is farther off. A margin of 4 mm lies in the middle of a band."""
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Faces of a garment that have one colour."""
+    """Faces of a garment that share a colour."""
 
     faces: NDArray[np.int64]
     """Shape (K, 3), K may be 0."""
@@ -52,13 +52,13 @@ class Band:
 
 
 class BandFinder:
-    """Finds the bands of garments on one person's body after the other; what it prepares for a topology it keeps."""
+    """Finds the bands of garments on one person's body at a time; keeps what it has prepared for a topology."""
 
     def __init__(self) -> None:
         self._checkers: dict[int, tuple[NDArray[np.int64], CollisionChecker, ExactSdf]] = {}
 
     def bands(self, marking: Marking, garments: Sequence[SceneMesh], body: SceneMesh | None) -> list[list[Band]]:
-        """The bands of each garment of a person: always as many for one marking.
+        """The bands of each garment of a person; their number depends only on the marking.
 
         Raises `MeshError` for a body that isn't a closed surface.
         """
@@ -72,7 +72,7 @@ class BandFinder:
         return [_clearance(sdf, one) for one in garments]
 
     def _prepared(self, faces: NDArray[np.int64]) -> tuple[CollisionChecker, ExactSdf]:
-        # A film hands out the same array again and again: its identity is asked before its content.
+        # A film hands out the same array again and again, so comparing identities is enough.
         known = self._checkers.get(id(faces))
         if known is None or known[0] is not faces:
             known = faces, CollisionChecker(faces), ExactSdf(faces, sign="winding")

@@ -1,4 +1,4 @@
-"""Plays a film: a clock, a panel, and what of the shapes is shown."""
+"""Plays a film: a clock, a panel, and the choice of shapes to show."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _SPEEDS = {"¼ ×": 0.25, "½ ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
 _HIDDEN = "hidden"
 _BODIES = {"collider": BODY, "skin": SKIN, _HIDDEN: ""}
 _GROUND_FRAMES = 5
-"""Frames whose lowest point is the ground."""
+"""Number of frames whose lowest point sets the ground."""
 _IDLE_S = 0.5
-"""How often a player that rests looks whether it is to end [s]."""
+"""How often an idle player checks whether to end [s]."""
 
 
 class Player:
-    """One film in one server. What the panel's callbacks ask for is done by the thread that runs `run`."""
+    """One film on one server. The thread in `run` does what the panel's callbacks ask for."""
 
     def __init__(self, server: viser.ViserServer, film: Film) -> None:
         self._server, self._film = server, film
@@ -56,7 +56,7 @@ class Player:
             film.told = self._changed.set
 
     def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
-        """Plays until an interrupt, or until asked after each frame."""
+        """Plays until an interrupt, or until `until`, asked after each frame, returns true."""
         last = time.monotonic()
         while not until():
             now = time.monotonic()
@@ -76,11 +76,11 @@ class Player:
                 index = int(np.searchsorted(self._times, self._moment, side="right")) - 1
             if asked or index != self._index:
                 self._show(index)
-                last = max(last, time.monotonic() - 1.0)  # a frame that took long isn't made up for by a leap
+                last = max(last, time.monotonic() - 1.0)  # don't leap ahead after a slow frame
             self._changed.wait(self._pause())
 
     def _pause(self) -> float:
-        """Until the next frame is due [s]."""
+        """Time until the next frame is due [s]."""
         if not self._playing:
             return _IDLE_S
         following = self._times[self._index + 1] if self._index + 1 < len(self._times) else self._length
@@ -88,7 +88,7 @@ class Player:
 
     @property
     def _length(self) -> float:
-        """Of the film, the last frame shown as long as the others [s]."""
+        """Length of the film, with the last frame shown as long as the others on average [s]."""
         steps = len(self._times) - 1
         return float(self._times[-1]) * (steps + 1) / steps if steps and self._times[-1] > 0 else 1.0
 
@@ -130,7 +130,7 @@ class Player:
         return box is None or isinstance(self._film, DressedFilm) or bool(box.value)
 
     def _rewear(self) -> None:
-        """Other garments or another distance, if that was asked for."""
+        """Changes garments or distance, if that was asked for."""
         film = self._film
         if not isinstance(film, DressedFilm):
             return
@@ -148,7 +148,7 @@ class Player:
                 self._refused = wanted, sdf
 
     def _tell(self, what: str) -> None:
-        """Once, to everybody who looks."""
+        """Notifies all connected clients, once."""
         if what != self._failed:
             self._failed = what
             for client in self._server.get_clients().values():
@@ -162,7 +162,7 @@ class Player:
         gui.set_panel_label(f"refu view: {printable(film.title)}")
         names = list(dict.fromkeys(shape.name for shape in first if shape.is_garment))
         last = max(len(self._times) - 1, 1)
-        is_live = isinstance(film, LiveFilm)  # there is no going back, and a body may come later
+        is_live = isinstance(film, LiveFilm)  # it can't go back, and a body may come later
         with gui.add_folder("Play"):
             self._frame = gui.add_slider("frame", 0, last, 1, 0, disabled=len(self._times) < 2, visible=not is_live)
             self._button = gui.add_button(self._verb(), icon=None, visible=not is_live)
@@ -200,7 +200,7 @@ class Player:
         self._changed.set()
 
     def _sought(self, event: Any) -> None:
-        if event.client is not None:  # somebody moved it; the player's own moves come back, too
+        if event.client is not None:  # a user moved it; the player's own changes trigger this, too
             self._seek = int(self._frame.value)
             self._changed.set()
 
@@ -214,7 +214,7 @@ class Player:
 
 
 def _legend() -> str:
-    """The colours of the bands of clearance."""
+    """The legend of the clearance bands."""
     lines, below = [], 0.0
     for limit, color in CLEARANCE:
         shade = "#" + "".join(f"{round(255 * channel):02x}" for channel in color)

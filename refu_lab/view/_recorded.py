@@ -1,4 +1,4 @@
-"""A film of what a bag has recorded: markers of the node or of a replay, as they are."""
+"""A film of the markers in a bag, of the node or of a replay, as they were recorded."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from refu_lab.view._film import Cache, SceneMesh
 from refu_lab.view._markers import MarkerScene, shows_meshes
 
 _LONGEST_PAUSE_S = 1.0
-"""A longer one, between a bag's runs, is cut to this [s]."""
+"""Longer pauses, as between the runs in a bag, are cut to this [s]."""
 _LOOKED_AT = 100
-"""Messages of markers among which a mesh is looked for."""
+"""Number of marker messages that are searched for a mesh."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class _RecordedMesh:
 
 
 class RecordedFilm:
-    """Garments and bodies of a bag. Vertices lie in a temporary file: however long the bag, memory doesn't grow.
+    """Garments and bodies in a bag. Their vertices are in a temporary file, so long bags don't take more memory.
 
     Raises `RefuError` for a bag that can't be read, or without a triangle list.
     """
@@ -44,7 +44,7 @@ class RecordedFilm:
     def __init__(self, path: Path, *, progress: bool = False) -> None:
         self.title = path.name
         self.notes: list[str] = []
-        """What there is to warn of, for people."""
+        """Warnings for the user."""
         self._spool = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the film)
         self._size = 0
         scene: MarkerScene[_RecordedMesh] = MarkerScene(self._store)
@@ -63,7 +63,7 @@ class RecordedFilm:
                     continue
                 n_odd += n
                 if stamp == stamp_ns and moments:
-                    moments.pop()  # the node's topics of one moment are written one after the other, with one stamp
+                    moments.pop()  # the node's topics of one moment follow each other with the same stamp
                 stamp_ns = stamp or stamp_ns
                 moments.append((message.log_time_ns, scene.shown(message.log_time_ns)))
             self.notes += reader.warnings
@@ -84,19 +84,19 @@ class RecordedFilm:
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """From the first frame on [s], shape (T,)."""
+        """Times of the frames, from the first one on [s], shape (T,)."""
         return self._times
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
-        """What was recorded of a moment."""
+        """What was recorded at a moment."""
         return self._cache.get(index, self._read)
 
     def facts(self, index: int) -> list[str]:
-        """Nothing but what is seen is known."""
+        """The number of meshes: nothing else is known."""
         return [f"{len(self._frames[index])} meshes, as recorded"]
 
     def close(self) -> None:
-        """Gives the temporary file back."""
+        """Deletes the temporary file."""
         self._spool.close()
 
     def _store(self, shape: SceneMesh) -> _RecordedMesh:
@@ -121,19 +121,19 @@ class RecordedFilm:
 
 
 def marker_topics(reader: adapters.BagReader) -> list[adapters.TopicInfo]:
-    """Topics of a bag that carry markers: garments and bodies, as a rule."""
+    """A bag's topics of markers, usually garments and bodies."""
     return [topic for topic in reader.topics if topic.message_type == adapters.MARKER_ARRAY and topic.message_count]
 
 
 def has_meshes(path: Path) -> bool:
-    """Whether a bag's markers show meshes, as those of garments do. Raises `BagError` for what is no bag."""
+    """Whether a bag's markers show meshes, as those of garments do. Raises `BagError` if it isn't a bag."""
     with adapters.BagReader(path) as reader:
         first = islice(reader.messages({topic.name for topic in marker_topics(reader)}), _LOOKED_AT)
         return any(shows_meshes(message.data) for message in first)
 
 
 def _front(path: Path) -> float:
-    """Where the person faces at the beginning, if the bag has SMPL parameters in SMPL's axes; along x where not."""
+    """Where the person faces at first [rad], by the bag's SMPL parameters (taken in SMPL's axes); else along x."""
     try:
         frame = next((record.frame for record in adapters.iter_smpl_frames(path) if record.frame is not None), None)
     except RefuError:

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from refu_lab.view._marks import Band
 
 _FOV = 30.0
-"""From the bottom to the top of the picture [degrees]: a long lens, so that a person has a person's proportions."""
+"""Vertical field of view [degrees]: a long lens, so that proportions look natural."""
 _SIDE = 0.45
-"""How far the first view is from the person's front [rad]: a little from the side."""
+"""Angle between the first view and the person's front [rad]: a little from the side."""
 _SKY, _EARTH, _SUN = (236, 242, 255), (176, 166, 156), (255, 244, 228)
 _GROUND, _LINES, _SECTIONS = (238, 239, 241), (214, 217, 222), (190, 195, 203)
 
 Key = tuple[str, str, int]
-"""Person, shape, and number of its band."""
+"""Names of person and shape, and number of the band."""
 
 
 @dataclass(eq=False)
@@ -40,7 +40,7 @@ class _Shown:
 
 
 class Stage:
-    """Draws frames; who connects later sees the last."""
+    """Draws frames; a client that connects later sees the last one."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -54,7 +54,7 @@ class Stage:
         self._world = scene.add_frame("/world", show_axes=False)
 
     def set(self, shapes: Sequence[SceneMesh], *, ground: float, front: float) -> None:
-        """Puts the ground under the first frame, and the camera before it.
+        """Puts the ground under the first frame, and the camera in front of it.
 
         `ground` is its height [m]; `front` is where the person faces, from x towards y [rad].
         """
@@ -76,7 +76,7 @@ class Stage:
             plane_opacity=1.0,
             position=(0.0, 0.0, ground - 0.002),
         )
-        # The key from one side of the camera, a paler fill from the other, as photographers have it.
+        # A key light from one side of the camera, a paler fill light from the other, as in photography.
         for name, angle, color, intensity, height in (
             ("key", front - 0.45, _SUN, 1.9, 4.5),
             ("fill", front + 1.5, _SKY, 0.7, 2.0),
@@ -100,14 +100,14 @@ class Stage:
         camera.near = 0.02
 
     def follow(self, shapes: Sequence[SceneMesh]) -> None:
-        """Brings the world to where the camera is: the middle of a person over the origin."""
+        """Moves the world so that the middle of a person is over the origin, where the camera looks."""
         if shapes:
             low, high = (np.stack([at(shape.vertices, 0) for shape in shapes]) for at in (np.min, np.max))
             middle = (low.min(0) + high.max(0)) / 2
             self._world.position = (-float(middle[0]), -float(middle[1]), 0.0)
 
     def draw(self, bands: Iterable[tuple[SceneMesh, Sequence[Band]]], *, wireframe: bool) -> None:
-        """Shows these, and nothing else."""
+        """Shows these bands, and nothing else."""
         with self._server.atomic():
             left = set(self._drawn)
             for shape, parts in bands:
@@ -141,11 +141,11 @@ class Stage:
             color=band.color,
             side="double" if shape.is_garment else "front",
             wireframe=wireframe,
-            receive_shadow=False,  # maps of a few thousand texels draw stripes on cloth that is seen from near
+            receive_shadow=False,  # shadow maps of a few thousand texels draw stripes on cloth seen close up
         )
         self._drawn[key] = _Shown(mesh, band.faces, len(shape.vertices), band.color)
 
 
 def _node(name: str) -> str:
-    """A name as a scene's tree takes it."""
+    """A name that can be a node of the scene tree."""
     return name.replace("/", "_")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 8080
 _PORTS = 20
-"""Ports that are tried from the default one on."""
+"""Number of ports that are tried, from the default one on."""
 
 
 @one_thread()
@@ -38,9 +38,9 @@ def view(
     say: Callable[[str], None] = print,
     until: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Shows the inputs until it is interrupted (Ctrl-C, which ends it), or until `until` says so.
+    """Shows the inputs until it is interrupted (Ctrl-C), or until `until` returns true.
 
-    Raises `RefuError` for inputs that can't be shown, a port that is taken, and where viser isn't installed.
+    Raises `RefuError` for inputs that can't be shown, for a port that is taken, and if viser isn't installed.
     """
     if find_spec("viser") is None:
         msg = 'the viewer needs viser: pip install "refu-ros[view]"'
@@ -74,7 +74,7 @@ def view(
 
 
 def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm | LiveFilm:
-    """What the inputs are: a bag of garments is shown as it is, motion is dressed. Raises `RefuError`."""
+    """The film of the inputs: a bag of garments is shown as it is, motion is dressed. Raises `RefuError`."""
     if (options.live is None) == (not options.inputs):
         msg = "wanted either recordings to look at or --live, for a node that runs"
         raise RefuError(msg)
@@ -94,7 +94,7 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
 
 
 def _serve(options: ViewOptions) -> viser.ViserServer:
-    """A server at the port that was asked for, or at a free one."""
+    """A server at the requested port, or at a free one."""
     import viser
 
     port = options.port
@@ -103,7 +103,7 @@ def _serve(options: ViewOptions) -> viser.ViserServer:
     if not _is_free(options.host, port):
         msg = f"{options.host}:{port} can't be listened on: it is taken, or no address of this machine (--port, --host)"
         raise RefuError(msg)
-    with contextlib.redirect_stdout(io.StringIO()):  # it greets in a box of its own
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner
         return viser.ViserServer(host=options.host, port=port, verbose=False)
 
 

@@ -23,7 +23,7 @@ class Cut(Protocol):
 
 @dataclass(frozen=True)
 class Plane:
-    """Keeps what lies on the side of a coordinate plane: hems, waists, sleeve ends."""
+    """Keeps what lies on one side of a coordinate plane: hems, waists, sleeve ends."""
 
     axis: int
     at: float
@@ -43,8 +43,8 @@ class Plane:
 class Neckline:
     """Keeps what lies outside an upright elliptic cylinder: seen from above, the neck's opening is an ellipse.
 
-    The back of the neck slopes like a cylinder that leans forward would; an upright one meets both back and chest at
-    an angle, and is lower in front because the chest is.
+    A cylinder that leans forward would run along the back of the neck; an upright one meets both back and chest at an
+    angle, and the opening is lower in front because the chest is.
     """
 
     centre: tuple[float, float, float]

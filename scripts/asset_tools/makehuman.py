@@ -35,7 +35,7 @@ _PROPORTIONS = ("idealproportions", "uncommonproportions")
 _CUPS = ("mincup", "averagecup", "maxcup")
 _FIRMNESS = ("minfirmness", "averagefirmness", "maxfirmness")
 
-# A target moves the mesh by the product of how far a person is each of the things in its name.
+# A target's weight is the product of how far each of the factors in its name applies to a person.
 _BUILD = (_GENDERS, _AGES, _MUSCLES, _WEIGHTS)
 _TARGETS = (
     ("macrodetails/universal-", _BUILD),
@@ -77,7 +77,7 @@ class BaseMesh:
 
     @cached_property
     def mirror(self) -> NDArray[np.int64]:
-        """The vertex that is a vertex's mirror image, shape (n,): the base mesh is exactly symmetric."""
+        """The mirror image of each vertex, shape (n,): the base mesh is exactly symmetric."""
         distance, image = cKDTree(self.vertices).query(self.vertices * MIRROR)
         if distance.max() > 0:
             msg = f"the base mesh should be symmetric, {np.count_nonzero(distance)} vertices have no mirror image"

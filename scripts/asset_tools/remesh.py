@@ -45,7 +45,7 @@ def closest_on_polyline(points: Vertices, curve: Vertices) -> tuple[Vertices, ND
 
 
 class _Mesh:
-    """A manifold mesh under edition: faces by number, and the faces of every vertex."""
+    """A manifold mesh that is being edited: faces by number, and the faces of every vertex."""
 
     def __init__(self, v: Vertices, f: Faces, sizing: Sizing) -> None:
         self.points: list[NDArray[np.float64]] = list(np.asarray(v, dtype=np.float64))
@@ -85,7 +85,7 @@ class _Mesh:
         p = [moved[x] if moved and x in moved else self.points[x] for x in face]
         return _cross(p[1] - p[0], p[2] - p[0])
 
-    # -- editions
+    # -- edits
 
     def remove(self, i: int) -> None:
         for vertex in self.faces.pop(i):
@@ -187,7 +187,7 @@ class _Mesh:
         return {(min(p, q), max(p, q)) for p, q in ((a, c), (c, b), (b, d), (d, a))}
 
     def _cotangent(self, at: int, a: int, b: int) -> float:
-        """Of the angle at a corner: the sum over both sides of an edge is negative exactly where Delaunay fails."""
+        """Cotangent of a corner's angle: the sum over an edge's two sides is negative exactly where Delaunay fails."""
         u, w = self.points[a] - self.points[at], self.points[b] - self.points[at]
         n = _cross(u, w)
         return float(u @ w / max(np.sqrt(n @ n), 1e-18))

@@ -44,9 +44,9 @@ class ShapeSpace:
     mean: NDArray[np.float64]
     """T-pose [m], shape (n, 3)."""
     basis: NDArray[np.float64]
-    """[m] a unit of beta, shape (n, 3, 10)."""
+    """[m] per unit of beta, shape (n, 3, 10)."""
     joints: NDArray[np.float64]
-    """Of the people it was fitted to [m], shape (count, 24, 3)."""
+    """Joints of the people it was fitted to [m], shape (count, 24, 3)."""
     betas: NDArray[np.float64]
     """Their scores, shape (count, 10)."""
 
@@ -54,8 +54,8 @@ class ShapeSpace:
     def fit(cls, samples: NDArray[np.float32], joints: NDArray[np.float64], mesh: BaseMesh) -> ShapeSpace:
         """Principal components of the body, every vertex weighted by its area, made exactly symmetric.
 
-        By variance, except that beta 1 is the one that says most about girth. Beta 0 grows with height, beta 1 with
-        girth. The helpers follow by regression.
+        In order of variance, except that beta 1 is the one that says most about girth. Beta 0 grows with height, beta 1
+        with girth. The helpers follow by regression.
         """
         count = len(samples)
         body = mesh.triangles("body")
@@ -70,12 +70,12 @@ class ShapeSpace:
         corners = samples[:, body].astype(np.float64)
         volume = np.einsum("sfk,sfk->s", corners[:, :, 0], np.cross(corners[:, :, 1], corners[:, :, 2])) / 6
         girth = volume / height
-        # Of men and women together it is the third component that tells stout from slim.
+        # For men and women together, it is the third component that tells stout from slim.
         stoutness = [abs(np.corrcoef(betas[:, k], girth)[0, 1]) for k in (1, 2, 3)]
         second = 1 + int(np.argmax(stoutness))
         betas[:, [1, second]] = betas[:, [second, 1]]
         signs = [betas[:, 0] @ (height - height.mean()), betas[:, 1] @ (girth - girth.mean())]
-        # The rest has no everyday name: the farthest sample counts as positive.
+        # The others have no everyday meaning: the farthest sample counts as positive.
         signs += [betas[np.abs(betas[:, k]).argmax(), k] for k in range(2, N_BETAS)]
         betas = betas * np.sign(signs)
         basis = (betas.T @ centred / count).reshape(N_BETAS, -1, 3).transpose(1, 2, 0)
@@ -93,7 +93,7 @@ class TPose:
 
     @cached_property
     def joint_weights(self) -> NDArray[np.float64]:
-        """Joints from the vertices of the rest pose, shape (24, n)."""
+        """The matrix that gives joints from the vertices of the rest pose, shape (24, n)."""
         rows = []
         for name in JOINT_NAMES:
             side, _, stem = name.partition("_")
@@ -103,7 +103,7 @@ class TPose:
 
     @cached_property
     def _knuckles(self) -> dict[str, NDArray[np.float64]]:
-        """From little finger to index, by side."""
+        """Vertex weights of the vector from the little finger's knuckle to the index finger's, by side."""
         return {s: self.mesh.marker(f"{s}-finger-2-1") - self.mesh.marker(f"{s}-finger-5-1") for s in "lr"}
 
     def __call__(self, vertices: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

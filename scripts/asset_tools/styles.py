@@ -29,7 +29,7 @@ F64 = NDArray[np.float64]
 _CLEARANCE = 0.005
 """Distance that a cut made longer or wider keeps from the mean body [m]."""
 _DRAPES = 24
-"""Drapes of drawn parameters, besides the mean cut's and two of each parameter."""
+"""Number of drapes of drawn parameters, besides the mean cut's and two for each parameter."""
 
 
 def _smoothstep(value: F64, low: float, high: float) -> F64:
@@ -171,7 +171,7 @@ _ALONG_THE_BODY = ("length", "sleeve_length", "neckline", "rise")
 
 
 def tailored(garment: GarmentTemplate, body: SmplBody) -> tuple[F64, F64]:
-    """The mean cut [m], shape (N, 3), and its displacement a standard deviation of each parameter, shape (N, 3, 4)."""
+    """The mean cut [m], shape (N, 3), and its displacement per standard deviation of each parameter, (N, 3, 4)."""
     cut, parameters = _Cut(garment, body), garment.card.tailoring
     mean = cut.x.copy()
     fields = []
@@ -191,10 +191,10 @@ def tailored(garment: GarmentTemplate, body: SmplBody) -> tuple[F64, F64]:
 def build_styles(garment: GarmentTemplate, body: SmplBody) -> dict[str, F32]:
     """Cuts the garment's styles and finds the principal axes of their drapes on the mean body.
 
-    Returns what its file gets:
+    Returns the arrays for its file:
         v_template: the mean cut in the T-pose [m], shape (N, 3): each parameter in the middle of its range.
-        styledirs: displacement of the cut a unit of each γ [m], shape (N, 3, 4).
-        tailoring_from_style: parameters in standard deviations of a γ, (4, 4): p = A γ; orthogonal, so γ = Aᵀ p.
+        styledirs: displacement of the cut per unit of each γ [m], shape (N, 3, 4).
+        tailoring_from_style: parameters in standard deviations from γ, (4, 4): p = A γ; orthogonal, so γ = Aᵀ p.
     """
     mean, fields = tailored(garment, body)
     corners = np.concatenate((1.5 * np.eye(N_STYLES), -1.5 * np.eye(N_STYLES)))
@@ -210,7 +210,7 @@ def build_styles(garment: GarmentTemplate, body: SmplBody) -> dict[str, F32]:
     drapes = np.stack([draper.canonical(np.zeros(N_BETAS), score)[0] for score in scores]).astype(np.float64)
     weight = np.sqrt(vertex_areas(mean, draper.topology.mesh.faces))[None, :, None]
     centred = ((drapes - drapes.mean(0)) * weight).reshape(len(scores), -1)
-    slope, *_ = np.linalg.lstsq(scores - scores.mean(0), centred, rcond=None)  # (4, 3N): drape a unit of each parameter
+    slope, *_ = np.linalg.lstsq(scores - scores.mean(0), centred, rcond=None)  # (4, 3N): drape per unit parameter
     rotation = np.linalg.svd(slope.T, full_matrices=False)[2].T  # p = A γ
     rotation *= np.sign(rotation[np.abs(rotation).argmax(0), np.arange(N_STYLES)])  # larger is longer, wider, deeper
     found = {"v_template": mean, "styledirs": fields @ rotation, "tailoring_from_style": rotation}

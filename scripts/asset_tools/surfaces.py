@@ -1,4 +1,4 @@
-"""Small questions about triangle meshes given as vertices (V, 3) [m] and faces (F, 3)."""
+"""Small functions on triangle meshes given as vertices (V, 3) [m] and faces (F, 3)."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def boundary_loops(f: Faces) -> list[NDArray[np.int64]]:
 
 
 def compact(f: Faces) -> tuple[NDArray[np.int64], Faces]:
-    """The vertices that faces use, and the faces in their numbering."""
+    """The vertices that faces use, and the faces as indices into these."""
     used, local = np.unique(f, return_inverse=True)
     return used, local.reshape(-1, 3)
 
 
 def smoothing_matrix(f: Faces, n: int) -> scipy.sparse.csr_matrix:
-    """Mean of the neighbours; on a boundary, of the two neighbours along it. Shape (n, n)."""
+    """The matrix that takes the mean of the neighbours; on a boundary, of the two neighbours along it. Shape (n, n)."""
     edges = {(int(a), int(b)) for a, b in directed_edges(f)}
     border = {(a, b) for a, b in edges if (b, a) not in edges}
     on_border = {a for a, _ in border}
@@ -58,7 +58,7 @@ def smoothing_matrix(f: Faces, n: int) -> scipy.sparse.csr_matrix:
 
 
 def attach(points: Vertices, v: Vertices, f: Faces) -> scipy.sparse.csr_matrix:
-    """Barycentrics of the mesh's closest points: a matrix (P, V) that takes any vertex attribute to the points."""
+    """Barycentric weights of the mesh's closest points: a matrix (P, V) that takes vertex attributes to the points."""
     mesh = trimesh.Trimesh(v, f, process=False)
     closest, _, face = trimesh.proximity.closest_point(mesh, points)
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], closest).clip(0, 1)
