@@ -1,7 +1,7 @@
-"""The one place where input files are opened: regular ones alone, and no more of them than was asked for.
+"""The one place where input files are opened: only regular files, and no more of each than was asked for.
 
-A FIFO would keep its reader waiting for ever, a device has no end, and to open one may already do something. And where
-files are put in another's place, all of them or nothing.
+A FIFO would keep its reader waiting for ever; a device has no end, and opening one may already have an effect. Files
+are also replaced here, whole or not at all.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 from refu_core.errors import RefuError
 
 MAX_JSON_BYTES = 4 << 20
-"""What a card or a table takes at most; parsed, it may take a hundred times as much."""
+"""The most that a card or a table may take; parsed, it may take a hundred times as much."""
 _KINDS = {
     stat.S_IFDIR: "a directory",
     stat.S_IFIFO: "a FIFO",
@@ -31,13 +31,13 @@ _KINDS = {
 
 
 class InputFile(io.BufferedReader):
-    """A file of `size` bytes: no more of it is read even if it grows, and no room is made for more than that."""
+    """A file of `size` bytes: no more than that is read even if it grows, and no memory is reserved for more."""
 
     def __init__(self, raw: io.FileIO, size: int) -> None:
         super().__init__(raw)
         self.size = size
         self.step = size
-        """The most that `read` gives at once [bytes]; what asks for more finds the file cut short."""
+        """The most that one `read` returns [bytes]; to a caller that asks for more, the file seems to be cut short."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         """At most `size` bytes."""
@@ -46,15 +46,15 @@ class InputFile(io.BufferedReader):
 
 
 def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError], wanted: str) -> InputFile:
-    """Opens a regular file of 1 to `most` bytes, or a link to one, to read; `wanted` says what it should be.
+    """Opens a regular file of 1 to `most` bytes, or a link to one, for reading; `wanted` says what it should be.
 
-    Raises `error` where there is none, it isn't a regular file, it is empty (as those of /proc say) or too large, or it
-    can't be opened.
+    Raises `error` if there is no such file, or it isn't a regular one, is empty (as files in /proc claim to be), is too
+    large, or can't be opened.
     """
     try:
         got = _fault(Path(path).stat(), most)
         if not got:
-            # Another file may have taken its place by now: this one is looked at again, and opening it can't block.
+            # Another file may have taken its place by now, so the opened one is checked again; opening it can't block.
             raw = io.FileIO(path, opener=_without_waiting)
             found = os.fstat(raw.fileno())
             got = _fault(found, most)
@@ -78,7 +78,7 @@ def read_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
 
 
 def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: str) -> Any:
-    """The content of a JSON file of finite numbers. Raises `error` as `open_file`, and where it isn't one."""
+    """The content of a JSON file of finite numbers. Raises `error` as `open_file` does, and if it isn't such a file."""
     try:
         return parse_json(read_file(path, most=MAX_JSON_BYTES, error=error, wanted=wanted))
     except (ValueError, RecursionError) as cause:
@@ -89,15 +89,15 @@ def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: s
 
 
 def parse_json(text: bytes) -> Any:
-    """Raises `ValueError` for anything but JSON of finite numbers, `RecursionError` where it is nested too deeply."""
+    """Parses JSON of finite numbers. Raises `ValueError` for anything else, `RecursionError` if nested too deeply."""
     return json.loads(text, parse_float=_finite, parse_constant=_finite)
 
 
 @contextlib.contextmanager
 def replacing(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
-    """A file to write, which takes the place of `path` in one step when all of it is there; with `sync`, on the disk.
+    """A file to write to, which replaces `path` in one step once it is complete; with `sync`, once it is on the disk.
 
-    After an error, the system's own (`OSError`) for instance, `path` is what it was before.
+    After an error, an `OSError` of the system for instance, `path` is what it was before.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
     try:
@@ -113,19 +113,32 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
 
 
 @contextlib.contextmanager
-def exclusive(path: Path, *, error: RefuError) -> Iterator[None]:
-    """Holds a lock file. The lock goes with the process, however that ends; the file stays.
+def exclusive(path: Path, *, error: RefuError, is_kept: bool = True) -> Iterator[None]:
+    """Holds a lock file. The lock is released when the process ends, however it ends.
+
+    The file stays unless `is_kept` is false: then it is removed at the end of the block.
 
     Raises `error` when another process has it, `OSError` when the file can't be written.
     """
     import fcntl
 
-    with path.open("w") as file:
+    with contextlib.ExitStack() as stack:
+        while True:
+            file = stack.enter_context(path.open("w"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as cause:
+                raise error from cause
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(path.stat(), os.fstat(file.fileno())):
+                    break
+            # Its last holder removed the file after it was opened here: another one may be there by now.
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as cause:
-            raise error from cause
-        yield
+            yield
+        finally:
+            if not is_kept:
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
 
 def _finite(text: str) -> float:

@@ -1,4 +1,4 @@
-"""What `refu garment` does: makes garments of meshes, tries them on, lists those that there are."""
+"""What `refu garment` does: makes garments from meshes, tries them on, and lists the known ones."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from refu_lab.render import RenderMesh, Viewpoint, render, save_png
 from refu_lab.tables import format_table
 
 _MOST_CUT = 20
-"""As many triangles of a garment may cut the body in one pose without a warning: at an armhole's rim there are some."""
+"""Triangles of a garment that may cut the body in one pose without a warning: a few at an armhole's rim do."""
 _MOST_STRETCHED = 3.5
-"""How many times as long as at rest all but a thousandth of the edges are at most, before there is a warning."""
+"""There is a warning if over a thousandth of the edges are longer than this many times their length at rest."""
 
 
 def _name_of(mesh: Path) -> str:
-    """A name like the file's: `T-Shirt (1).obj` is `T-Shirt-1`."""
+    """A garment's name made from the file's: `T-Shirt (1).obj` gives `T-Shirt-1`."""
     plain = unicodedata.normalize("NFKD", mesh.stem).encode("ascii", "ignore").decode()
     return re.sub(r"[^A-Za-z0-9_]+", "-", plain).strip("-_") or mesh.stem
 
 
 def try_on_poses() -> dict[str, NDArray[np.float32]]:
-    """A few poses that people take, by name: rotation vectors [rad], shape (24, 3)."""
+    """A few ordinary poses, by name: rotation vectors [rad], shape (24, 3)."""
     stand, walk, reach = (standing_pose(arms) for arms in (1.0, 1.1, -0.9))
     walk[1, 0], walk[2, 0], walk[4, 0], walk[5, 0] = -0.45, 0.35, 0.25, 0.55
     walk[16, 1], walk[17, 1] = 0.3, 0.3
@@ -54,18 +54,20 @@ def try_on_poses() -> dict[str, NDArray[np.float32]]:
 
 
 def add_garment(options: AddOptions) -> dict[str, Any]:
-    """Makes a garment's file of a mesh, and tries it on; what was done, as plain values.
+    """Makes a garment's file from a mesh and tries the garment on; returns what was done, as plain values.
 
-    Raises `RefuError` for a mesh that can't be worn, and for a file that is there already.
+    Raises `RefuError` for a mesh that can't be worn, a name that isn't valid or isn't the file's, and a file that
+    exists already.
     """
     target = options.output or garments_folder() / f"{options.name or _name_of(options.mesh)}.npz"
     name = target.stem.removeprefix("garment_")
     if name in BUILTIN_GARMENTS:
         msg = f"{name} is a garment that ships: call this one otherwise (--name)"
         raise GarmentError(msg)
-    if options.name is not None:
-        require_name(options.name)  # of which a path may be made, too
-    require_name(name)
+    require_name(name if options.name is None else options.name)
+    if options.name not in (None, name):
+        msg = f"{target}: a garment is called as its file: leave --name out, or write {options.name}.npz"
+        raise GarmentError(msg)
     if target.exists() and not options.overwrite:
         msg = f"{target} is there already: give it another --name, or --overwrite it"
         raise GarmentError(msg)
@@ -105,7 +107,7 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
 
 
 def _number(text: str) -> float:
-    """NaN for what is none."""
+    """The number that a text gives; NaN if it isn't one."""
     try:
         return float(text)
     except ValueError:
@@ -123,7 +125,7 @@ def _placing(options: AddOptions) -> Placing:
 
 
 def _pose(text: str | None) -> NDArray[np.float64] | None:
-    """`t`, degrees that both arms hang down, or the first pose of a motion file."""
+    """The pose that a text stands for: `t`, how far both arms hang down [degrees], or a motion file's first pose."""
     if text is None:
         return None
     if Path(text).suffix.lower() in SUFFIXES:
@@ -131,7 +133,7 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
         if not np.isfinite(pose).all():
             msg = f"{text}: its first frame isn't finite, and wanted is the pose of the mesh: cut it out"
             raise GarmentError(msg)
-        pose[0] = 0  # the mesh stands upright; where it faces is --up's business
+        pose[0] = 0  # the mesh stands upright; --up gives its axes
         return pose
     angle = 0.0 if text == "t" else _number(text)
     if not -90 <= angle <= 90:
@@ -141,7 +143,7 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
 
 
 def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
-    """What is left of collisions with the body, and how far it is stretched, in each of a few poses, by skinning."""
+    """For each of a few poses, worn by skinning: the collisions left with the body, and how far it is stretched."""
     pipeline = GarmentPipeline.load([made.template], backbone="skinned")
     checker = CollisionChecker(pipeline.body.faces.numpy())
     found = {}
@@ -161,7 +163,7 @@ def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
 
 
 def warnings_of(worn: dict[str, dict[str, Any]]) -> list[str]:
-    """What there is to warn of where a garment was tried on."""
+    """Warnings about a garment that was tried on."""
     found = []
     if (most := max(left["pairs"] for left in worn.values())) > _MOST_CUT:
         found.append(f"{most} of its triangles cut the body: look at it (--picture) before you use it")
@@ -171,7 +173,7 @@ def warnings_of(worn: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def picture(garments: Sequence[str], *, size: tuple[int, int] = (260, 400), samples: int = 4) -> NDArray[np.uint8]:
-    """Garments worn together, a picture of `size` (width, height) a pose: sRGB, shape (height, poses width, 3)."""
+    """Garments worn together, a view of `size` (width, height) for each pose: sRGB, shape (height, poses width, 3)."""
     pipeline = GarmentPipeline.load(garments)
     faces = pipeline.body.faces.numpy()
     views = []
@@ -184,7 +186,7 @@ def picture(garments: Sequence[str], *, size: tuple[int, int] = (260, 400), samp
 
 
 def list_garments() -> list[dict[str, Any]]:
-    """All garments that have a name; one whose file is damaged has its `fault`."""
+    """A row for each named garment; one whose file is damaged says why in `fault`."""
     rows: list[dict[str, Any]] = []
     for name, path in garment_files().items():
         row: dict[str, Any] = {"garment": name, "from": "refu" if name in BUILTIN_GARMENTS else str(path)}

@@ -1,4 +1,4 @@
-"""The SMPL body model (Loper et al. 2015): shape, pose and joints to a posed mesh."""
+"""The SMPL body model (Loper et al. 2015): from shape, pose and joints to a posed mesh."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 N_POSE_FEATURES = 9 * (N_JOINTS - 1)
 _TENSOR = "{} as a torch.Tensor, such as torch.as_tensor(array) gives"
 _LARGEST = 1e6
-"""No model has larger numbers, and in float32 products of much larger ones are infinite."""
+"""No model has larger numbers, and products of much larger ones are infinite in float32."""
 
 
 class BodyOutput(NamedTuple):
@@ -40,7 +40,7 @@ class BodyOutput(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Bodies of some β before they are posed, in SMPL axes."""
+    """Bodies of given β before they are posed, in SMPL axes."""
 
     vertices: Tensor
     """Without pose blend shapes [m], shape (B, V, 3)."""
@@ -59,11 +59,11 @@ class BodyArrays:
     weights: NDArray[np.float64]
     """Skinning weights, rows sum to one, shape (V, 24)."""
     joint_regressor: NDArray[np.float64]
-    """Joints of a shape, rows sum to one, shape (24, V)."""
+    """Joints from the vertices of a shape, rows sum to one, shape (24, V)."""
     shapedirs: NDArray[np.float64]
-    """Displacement a unit of each beta [m], shape (V, 3, 10)."""
+    """Displacement per unit of each beta [m], shape (V, 3, 10)."""
     posedirs: NDArray[np.float64] | None
-    """Displacement a unit of each pose feature (entries of R_j - I, j = 1…23) [m], shape (V, 3, 207); None for none."""
+    """Displacement per unit of a pose feature (entries of R_j - I, j = 1…23) [m], shape (V, 3, 207); None for none."""
 
     @classmethod
     def from_mapping(cls, data: Mapping[str, Any], *, source: str) -> BodyArrays:
@@ -84,7 +84,7 @@ class BodyArrays:
                 msg = f"{source}: {key} is not an array of numbers: {error}"
                 raise BodyError(msg) from error
             # The parent of the root is 2**32 - 1 in official files; all else is metres, shares and indices.
-            largest = max(-array.min(initial=0), array.max(initial=0))  # NaN where there is one
+            largest = max(-array.min(initial=0), array.max(initial=0))  # NaN if any value is
             if not np.isfinite(largest) or (key != "kintree_table" and largest > _LARGEST):
                 msg = f"{source}: {key} has values that are NaN or infinite, or beyond {_LARGEST:g}"
                 raise BodyError(msg)
@@ -174,7 +174,7 @@ class SmplBody:
         return isinstance(other, SmplBody) and self._identity == other._identity
 
     def __hash__(self) -> int:
-        """By what makes bodies equal."""
+        """The hash of what makes bodies equal."""
         return hash(self._identity)
 
     @property
@@ -186,7 +186,7 @@ class SmplBody:
 
     @property
     def arrays(self) -> BodyArrays:
-        """The model's arrays as its file has them, in float64; those of built-in bodies are shared and read-only."""
+        """The model's arrays as in its file, in float64; those of built-in bodies are shared and read-only."""
         return self._arrays
 
     @property
@@ -196,7 +196,7 @@ class SmplBody:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of the model's arrays (16 hexadecimal digits): weights name the body that they were trained on by it."""
+        """Hash of the model's arrays (16 hexadecimal digits), by which weights name the body they were trained on."""
         digest = hashlib.sha256()
         for entry in fields(self._arrays):
             array = getattr(self._arrays, entry.name)
@@ -253,16 +253,16 @@ class SmplBody:
             return posed
         shift = _tensor("transl", transl, self.device)
         if shift.ndim != 2 or shift.shape[1] != 3 or len(shift) not in (1, batch):
-            msg = f"transl must have the shape ({batch}, 3), got {tuple(shift.shape)}"
+            msg = f"transl must have the shape ({batch}, 3) or (1, 3), got {tuple(shift.shape)}"
             raise FrameError(msg)
         return posed._replace(vertices=posed.vertices + shift[:, None], joints=posed.joints + shift[:, None])
 
     def shape(self, betas: Tensor) -> Shape:
-        """Bodies of betas (B, 10) as `posed` takes them."""
+        """The unposed bodies of betas (B, 10), as `posed` takes them."""
         return Shape(self.rest_vertices(betas), self.rest_joints(betas))
 
     def posed(self, pose: Tensor, shape: Shape) -> BodyOutput:
-        """Poses bodies: rotation vectors (B, 24, 3) [rad] of as many shapes, or of one."""
+        """Poses bodies by rotation vectors (B, 24, 3) [rad]; `shape` has as many bodies, or one for all."""
         require_type(pose, Tensor, _TENSOR.format("pose"), error=FrameError)
         rotations = rotvec_to_rotmat(pose)
         joints, transforms = forward_kinematics(rotations, shape.joints)

@@ -24,7 +24,7 @@ _LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 
 
 class LimbMeshes:
-    """The limbs of one posed body, each a mesh of its own: one for all garments on it."""
+    """The limbs of one posed body, each a mesh of its own, shared by all garments on it."""
 
     def __init__(self, body: SmplBody) -> None:
         """For poses of this body, on its device."""
@@ -39,7 +39,7 @@ class LimbMeshes:
         of_limbs = [faces[limb_of == k].astype(np.int32) for k in range(len(_LIMBS))]
         self.meshes = [wp.Mesh(points, ints(one.ravel(), self._device)) for one in of_limbs]
         self.bundles = bundled(body.v_template.cpu().numpy(), of_limbs, body.device)
-        """Boxes around what is near together of them."""
+        """Boxes around their faces that are close together."""
         self._fit = [
             recorded(bound_kernel, len(self.bundles.low), [points, self.bundles], self._device),
             recorded(enclose_kernel, len(self.meshes), [self.bundles], self._device),
@@ -54,7 +54,7 @@ class LimbMeshes:
                 command.launch()
 
     def pose(self, which: int) -> None:
-        """Refits the meshes of the limbs `which`, as bits, unless they are already."""
+        """Refits the meshes of the limbs `which`, given as bits, unless they are fitted already."""
         late = [k for k in np.flatnonzero(self._is_late) if (which >> k) & 1]
         refit([self.meshes[k] for k in late], self._vertices.device)
         self._is_late[late] = False
@@ -63,8 +63,9 @@ class LimbMeshes:
 class Press:
     """Keeps a garment between the skin that it lies on and the limbs that it doesn't lie on (docs/architecture.md).
 
-    Where another limb comes between a vertex and its skin, the vertex is drawn back to this side of it, and neighbours
-    with it. All of it is continuous: the farther back, the nearer the limb is to the way from skin to vertex.
+    Where another limb comes between a vertex and its skin, the vertex is drawn back to the skin's side of it, and its
+    neighbours with it. All of this is continuous: the nearer a limb is to the line from skin to vertex, the farther
+    back the vertex goes.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class Press:
         self._counts = memory(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
         own = weight_of_parts(garment.weights, _LIMBS) > 0
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
-        # Cloth that lies on the skin gives way as one piece: of its vertices a few are asked, and others follow those.
+        # Cloth that lies on the skin gives way as one piece: only some of its vertices are tested, and others follow.
         rest = garment.v_template.cpu().numpy()
         is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.limb_reach
         is_asked = is_loose | garment.mesh.independent()
@@ -101,9 +102,8 @@ class Press:
             "foreign": foreign,
             "ring_start": ring.start,
             "ring": ring.items,
-            "rows": np.arange(n),
             "front": np.zeros(2 * n),
-        } | dict.fromkeys(("boxed", "near", "in_front"), np.zeros(n))
+        } | dict.fromkeys(("boxed", "near", "in_front", "rows"), np.zeros(n))
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
         feel = kernels.Feel()
@@ -124,7 +124,7 @@ class Press:
 
     @torch.no_grad()
     def __call__(self, points: Tensor, skin: Tensor) -> Tensor:
-        """The garment (N, 3) [m], pressed to `skin` (N, 3) [m], which it lies on, by the limbs as they are."""
+        """The garment (N, 3) [m], pressed by the limbs to the `skin` (N, 3) [m] that it lies on."""
         self._points.copy_(points)
         self._skin.copy_(skin)
         self._counts.zero_()

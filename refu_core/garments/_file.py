@@ -1,4 +1,4 @@
-"""A garment's file: its mesh and all that is known of it, one `.npz`; and where such files live."""
+"""A garment's file, one `.npz` with its mesh and all that is known of it; and where such files live."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BUILTIN = Path(__file__).parents[1] / "assets"
 
 
 def garments_folder() -> Path:
-    """The user's garments: $REFU_GARMENTS, or refu/garments in $XDG_DATA_HOME (~/.local/share); it needs not exist."""
+    """The user's garments: $REFU_GARMENTS, or refu/garments in $XDG_DATA_HOME (~/.local/share); it may not exist."""
     if os.environ.get("REFU_GARMENTS"):
         return Path(os.environ["REFU_GARMENTS"]).expanduser()
     shared = os.environ.get("XDG_DATA_HOME")
@@ -34,14 +34,14 @@ def garments_folder() -> Path:
 
 
 def garment_files() -> dict[str, Path]:
-    """The file of each garment that has a name: those that ship, then the user's. Of one name, the one that ships."""
+    """The file of each garment by name: those that ship, then the user's. For the same name, the one that ships."""
     found = {name: _BUILTIN / GARMENT_FILE.format(name) for name in BUILTIN_GARMENTS}
     try:
         own = sorted(garments_folder().glob("*.npz"))
-    except (OSError, RuntimeError):  # no home, no permission: nobody's garments
+    except (OSError, RuntimeError):  # no home or no permission: no garments of the user's
         own = []
     for path in own:
-        found.setdefault(path.stem.removeprefix("garment_"), path)
+        found.setdefault(_name_in(path), path)
     return found
 
 
@@ -59,7 +59,7 @@ def load_garment(
         garment: name of one that ships or is in the user's folder (`garment_files`), or the path of an `.npz` as
             `refu_core/assets/README.md` describes it. `garment_kilt.npz` and `kilt.npz` are the garment `kilt`.
         device: torch device.
-        dtype: of all but the faces.
+        dtype: of all tensors but the faces.
 
     Raises:
         GarmentError: there is no such garment, or the file isn't one.
@@ -87,20 +87,20 @@ def _unknown(garment: str, known: list[str]) -> str:
 
 
 def garment_name(garment: str | os.PathLike[str]) -> str:
-    """The name of a garment that was asked for by its name or by its file's path, which needs not be there."""
+    """The name of a garment that is given by its name or by its file's path; the file needn't exist."""
     text = os.fspath(garment)
-    return Path(text).stem.removeprefix("garment_") if text.endswith(".npz") else text
+    return _name_in(Path(text)) if text.endswith(".npz") else text
 
 
 def require_name(name: str) -> None:
-    """Raises `GarmentError` for a name that no garment has: topics and files are called by it."""
+    """Raises `GarmentError` for a name that no garment may have: topics and files are named after it."""
     if not _NAME.fullmatch(name):
         msg = f"no garment is called {name!r}: wanted letters, digits, - and _ (--name)"
         raise GarmentError(msg)
 
 
 def _read(path: Path, device: str | torch.device, dtype: torch.dtype) -> GarmentTemplate:
-    name = path.stem.removeprefix("garment_")
+    name = _name_in(path)
     try:
         require_name(name)
     except GarmentError as error:
@@ -135,14 +135,15 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
 
     Lengths are kept to a micrometre and shares to a hundred-thousandth, which halves the file.
 
-    Returns the file. Raises `GarmentError` for a path that doesn't end in `.npz`, or can't be written.
+    Returns the file's path. Raises `GarmentError` for anything that isn't a template, a card that is too long, and a
+    path that doesn't end in `.npz`, gives no valid name or can't be written.
     """
     require_type(template, GarmentTemplate, "a GarmentTemplate, such as load_garment gives", error=GarmentError)
     target = Path(path)
     if target.suffix != ".npz":
         msg = f"{target}: wanted the path of an .npz"
         raise GarmentError(msg)
-    require_name(target.stem)  # it is the garment's when it is read
+    require_name(_name_in(target))  # it becomes the garment's name when the file is read
     card = card_to_json(template.card).encode()
     if len(card) > MAX_TEXT_BYTES:
         msg = f"{target}: wanted a card of at most {MAX_TEXT_BYTES} bytes, got {len(card)}: say less of its provenance"
@@ -171,15 +172,20 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
     return target
 
 
+def _name_in(path: Path) -> str:
+    """The name of the garment in a file."""
+    return path.stem.removeprefix("garment_")
+
+
 def _rounded(tensor: torch.Tensor, bits: int) -> NDArray[np.float32]:
-    """To multiples of 2^-bits: the bits that say nothing are zeros, which take no room when packed."""
+    """Rounds to multiples of 2^-bits: the insignificant bits become zeros, which compress to nothing."""
     scale = float(1 << bits)
     found: NDArray[np.float32] = (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
     return found
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
-    """The card of a garment's file. Raises `ValueError` or `MeshError` where file and card make no garment."""
+    """The card of a garment's file. Raises `ValueError` or `MeshError` if file and card don't make a garment."""
     missing = [key for key in _NEEDED if key not in data]
     if missing:
         msg = f"it has no {missing[0]}"

@@ -25,33 +25,33 @@ if TYPE_CHECKING:
 
 F32 = NDArray[np.float32]
 _OFF_CENTRE = 0.37
-"""Where cells begin, in cells: not at the body's plane of symmetry, where the last bit would say which cell it is."""
+"""Offset of the grid [cells]: if the body's plane of symmetry were a border, the last bit would choose the cell."""
 
 
 class Measured(NamedTuple):
-    """N points as the person's root sees them."""
+    """N points in the axes of the person's root."""
 
     points: F32
     """[m], shape (N, 3)."""
     say: F32
-    """How much each says, at most one, shape (N,)."""
+    """How much each point counts, at most one, shape (N,)."""
 
 
 class Matches(NamedTuple):
     """M points and their places on the cloth."""
 
     say: F32
-    """How much each says, shape (M,)."""
+    """How much each point counts, shape (M,)."""
     face: NDArray[np.int32]
     weight: F32
-    """Of the face's corners, shape (M, 3)."""
+    """Weights of the face's corners, shape (M, 3)."""
     normal: F32
     height: F32
-    """Off the cloth along the normal [m], shape (M,)."""
+    """Height off the cloth along the normal [m], shape (M,)."""
 
 
 class ObservedCloth:
-    """The numbers of one garment that points may change, and what they do to it before it is posed."""
+    """The numbers of one garment that points may change, and how they displace it before it is posed."""
 
     def __init__(self, garment: GarmentTemplate, settings: ObservationSettings) -> None:
         self._settings = settings
@@ -68,8 +68,8 @@ class ObservedCloth:
         self.estimate = Estimate(np.full(len(std), settings.remembered), settings.bound)
         self.reset()
         on_rim = garment.mesh.n_faces_of_edge[garment.mesh.edge_of_corner] == 1
-        # Bit k says that the edge across from weight k is on the boundary, in the kernel's order of weights.
-        bits = (on_rim[:, [1, 2, 0]] * np.array([2, 4, 1])).sum(1)
+        # Bit k says that the edge from corner k to the next is on the boundary.
+        bits = (on_rim * np.array([1, 2, 4])).sum(1)
         self._rim = ints(bits, "cpu")
         self._points = garment.v_template.detach().cpu().float().clone()
         self._mesh = wp.Mesh(as_warp(self._points, wp.vec3), ints(self._faces.ravel(), "cpu"))
@@ -80,34 +80,34 @@ class ObservedCloth:
         self._lift = np.zeros(len(self._out), np.float32)
 
     def wait(self, seconds: float) -> None:
-        """Lets time pass. What is drawn fades as the numbers do."""
+        """Lets time pass. The displacement fades as the numbers do."""
         self.estimate.wait(seconds)
         self._lift *= math.exp(-seconds / self._settings.remembered)
 
     def draw(self, numbers: NDArray[np.float64]) -> None:
-        """Takes over what the numbers (D,) say, in standard deviations."""
+        """Sets the displacement to that of numbers (D,), in standard deviations."""
         self._lift = self._fields @ numbers.astype(np.float32)
 
     @property
     def offset(self) -> F32:
-        """What is drawn adds to the garment before it is posed [m], shape (V, 3)."""
+        """The displacement that is added to the garment before it is posed [m], shape (V, 3)."""
         found: F32 = self._lift[:, None] * self._out
         return found
 
     def place(self, vertices: F32) -> None:
-        """Takes over where it is [m], shape (V, 3)."""
+        """Takes over where the garment's vertices are [m], shape (V, 3)."""
         self._points.copy_(torch.from_numpy(vertices))
         self._mesh.refit()
 
     @property
     def tree(self) -> int:
-        """Warp's handle of where it is."""
+        """Warp's handle of the mesh of the garment where it is."""
         return int(self._mesh.id)
 
     def match(
         self, measured: Measured, skin: wp.Mesh, others: Sequence[int], eye: NDArray[np.float64] | None
     ) -> Matches:
-        """Which of the points are the cloth's, and no other garment's of these trees, and where."""
+        """Which of the points are the cloth's, not those of other garments (trees `others`), and where on it."""
         how = self._settings
         own = self._points.numpy()
         rows = np.flatnonzero(within(measured.points, own.min(0) - how.reach, own.max(0) + how.reach))
@@ -122,15 +122,15 @@ class ObservedCloth:
         return Matches(measured.say[rows[on]], face[on], weight[on], normal[on], height[on])
 
     def slopes(self, found: Matches, blend: F32) -> F32:
-        """How the cloth rises along each match's normal with each number, shape (M, D).
+        """How far each number moves the cloth along each match's normal, shape (M, D).
 
-        `blend` (V, 3, 3) is what poses a displacement.
+        `blend` (V, 3, 3) poses a displacement.
         """
         m = len(found.face)
         corner = self._faces[found.face].astype(np.int32)
         along = np.matmul(found.normal[:, None, None], blend[corner])[:, :, 0] * found.weight[:, :, None]
         lift = (along * self._out[corner]).sum(2)
-        # A sparse product: what it gathers is as large as a processor's cache, and isn't copied first.
+        # A sparse product needs no copy of the rows that it gathers, which are as large as a processor's cache.
         ends = 3 * np.arange(m + 1, dtype=np.int32)
         slopes: F32 = csr_array((lift.ravel(), corner.ravel(), ends), shape=(m, len(blend))) @ self._fields
         return slopes
@@ -145,8 +145,8 @@ def within(points: NDArray[np.floating], low: F32, high: F32) -> NDArray[np.bool
 
 
 def averaged(points: F32, settings: ObservationSettings) -> Measured:
-    """The points (N, 3) [m] by cells of space: a mean says what many do, with less noise, and is matched once."""
-    if len(points) > settings.most_points:  # a picture's are in rows, so that is even
+    """Means of the points (N, 3) [m] in cells of space: a mean has less noise than its points, and is matched once."""
+    if len(points) > settings.most_points:  # a picture's points are in rows, so this is even
         points = points[np.linspace(0, len(points) - 1, settings.most_points).astype(np.intp)]
     cell = np.floor(points / settings.cell + _OFF_CENTRE).astype(np.int64)
     cell -= cell.min(0)

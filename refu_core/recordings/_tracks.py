@@ -1,8 +1,9 @@
-"""Files that go image by image, with everybody who is in it: here a dictionary a person."""
+"""Files that list everybody in each image, rearranged as one dictionary per person."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -15,18 +16,18 @@ from refu_core.recordings._recording import MAX_FRAMES, interpolated
 from refu_core.recordings._rotations import is_one_frame
 
 _SAME = 0.75
-"""Who is farther from where a person was in the image before is somebody else [m], as for trackers."""
+"""Anybody farther than this from where a person was last seen is somebody else [m]; the same as for trackers."""
 _HOLDERS = (dict, list, tuple, Record)
-"""What holds anything; most values of a file are numbers, and aren't looked into."""
+"""Types that hold other values; most values of a file are numbers, and aren't searched."""
 _MOST_LOOKS = 200_000
-"""Values of a file that are looked at in search of persons: five thousand seconds of somebody at 30 Hz."""
+"""Most values of a file that are searched for persons: five thousand seconds of one person at 30 Hz."""
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 
 
 def frames_of(content: Content) -> Mapping[Any, Any]:
-    """The persons of frames that are each one pose, none where a file doesn't go frame by frame.
+    """The persons of a file that has one pose per person and frame; none if a file isn't arranged frame by frame.
 
-    Estimators that see single images leave a list of dictionaries, one of lists, or a dictionary by the image's name.
+    Estimators that see single images write a list of dictionaries, a list of lists, or a dictionary by image name.
 
     Raises `ValueError` for frames that don't fit each other.
     """
@@ -60,9 +61,9 @@ def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str
 
 
 def places_in_time(frames: NDArray[Any] | None, n: int, notes: list[str]) -> NDArray[np.int64] | None:
-    """Which frames n of them are, from 0 on, by their numbers; None where none is missing.
+    """Where n frames are in time, counted from 0, by their frame numbers; None if no frame is missing.
 
-    None, too, for numbers that can't be of one person's frames in time; `notes` gets why.
+    Also None for numbers that can't be those of one person's frames in time; the reason is added to `notes`.
     """
     if frames is None:
         return None
@@ -84,7 +85,7 @@ def places_in_time(frames: NDArray[Any] | None, n: int, notes: list[str]) -> NDA
 def filled(
     poses: NDArray[np.float64], transl: NDArray[np.float64], frames: NDArray[Any] | None, notes: list[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The frames that a tracker has lost in between, on the shorter arc between those around them."""
+    """The motion with the frames that a tracker lost filled in, on the shorter arc between those around them."""
     at = places_in_time(frames, len(poses), notes)
     if at is None:
         return poses, transl
@@ -98,8 +99,10 @@ def filled(
 
 
 def _rows_apart(content: Content) -> Content:
-    """Where a frame has arrays or lists with a row a person, a list of people an image: PHALP's `smpl` and `tid`, and
-    dictionaries by the image's name."""
+    """Makes frames with one row per person into a list of people per image; other content stays as it is.
+
+    Such frames are PHALP's `smpl` and `tid`, and dictionaries by image name, with arrays or lists in them.
+    """
     frames = entries(content.root) or {}
     insides = [entries(frame) or {} for frame in frames.values()]
     if frames and all("smpl" in inside and "tid" in inside for inside in insides):
@@ -135,7 +138,7 @@ def _rows(content: Content, seen: Mapping[Key, Any]) -> Any:
 
 
 def _layout_of(content: Content, node: Mapping[Key, Any]) -> table.Layout | None:
-    """The layout of which a mapping has one frame."""
+    """The layout of which a mapping holds one frame; None if there is none."""
     for layout in table.LAYOUTS:
         if layout.is_time_last or not all(node.get(name) is not None for name in layout.pose):
             continue
@@ -156,7 +159,7 @@ def _place_of(content: Content, body: Mapping[Key, Any], layout: table.Layout) -
 
 
 def _stacked(content: Content, layout: table.Layout, seen: list[tuple[int, Mapping[Key, Any]]]) -> dict[Key, Any]:
-    """One person's arrays, a row a frame; what isn't in every frame is left out."""
+    """One person's arrays, one row per frame; what isn't in every frame is left out."""
     track: dict[Key, Any] = {"frame_ids": np.array([number for number, _ in seen])}
     track |= {key: seen[0][1][key] for key in (*table.GENDERS, *table.MODELS) if seen[0][1].get(key) is not None}
     for name in (*layout.pose, *layout.transl, *layout.betas):
@@ -172,13 +175,14 @@ def _stacked(content: Content, layout: table.Layout, seen: list[tuple[int, Mappi
 
 
 def _sequences(root: Any, is_body: Callable[[Mapping[Key, Any]], bool]) -> Iterator[list[list[Mapping[Key, Any]]]]:
-    """Whatever has persons in it, frame by frame, from the outside inwards; lists that are shared are seen once.
+    """Every sequence of frames that have persons in them, from the outside inwards; shared lists are visited once.
 
-    People don't outnumber frames: a dictionary of one list isn't a frame with everybody of the list; it is looked into.
+    A dictionary counts only if no frame has more people than there are frames. Otherwise a dictionary that holds a
+    single list would be one frame with everybody in the list; instead, the list is searched.
     """
 
     def bodies(value: Any) -> list[Mapping[Key, Any]]:
-        """The persons of a frame: it is one, or has some; whoever is first shows which."""
+        """The persons of a frame: it is one person, or holds some, as the first mapping in it shows."""
         if type(value) not in _HOLDERS:
             return []
         if id(value) not in persons:
@@ -218,14 +222,15 @@ def _sequences(root: Any, is_body: Callable[[Mapping[Key, Any]], bool]) -> Itera
 
 
 def _name_of(body: Mapping[Key, Any]) -> str:
-    """What a tracker calls somebody; empty where it doesn't."""
+    """The name that a tracker gives somebody; empty if there is none."""
     return next((str(body[key]) for key in table.TRACK_IDS if isinstance(body.get(key), (int, str))), "")
 
 
 def _who_is_who(frames: Iterable[Sequence[tuple[str, NDArray[np.float64]]]]) -> Iterator[list[str]]:
-    """Names of those who are seen in each frame, by name and place (3,) [m]: the tracker's, else a number.
+    """Names of those seen in each frame, from given names and places (3,) [m]: the tracker's name, else a number.
 
-    Somebody without a name is who was nearest, if near enough; of no place (NaN), who comes as late in the list.
+    Somebody without a name is the person last seen nearest, if near enough. Without a place either (NaN), their number
+    is their position in the frame's list.
     """
     last: dict[str, NDArray[np.float64]] = {}
     for seen in frames:
@@ -236,8 +241,9 @@ def _who_is_who(frames: Iterable[Sequence[tuple[str, NDArray[np.float64]]]]) -> 
                 name = str(rank)
             elif not name:
                 near = {one: float(np.linalg.norm(last[one] - place)) for one in free}
-                name = min(near, key=near.__getitem__, default="")
-                name = name if name and near[name] <= _SAME else str(len(last))
+                near = {one: way for one, way in near.items() if way <= _SAME}  # never NaN: last seen without a place
+                new = next(number for number in map(str, count(len(last))) if number not in last)
+                name = min(near, key=near.__getitem__, default=new)
             free.discard(name)
             last[name] = place
             found.append(name)

@@ -25,7 +25,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Through memory: on a full disk torch's own writer raises errors of its own, and no system's.
+        # Through memory: on a full disk torch's own writer raises errors of its own instead of `OSError`.
         buffer = io.BytesIO()
         torch.save(dict(state), buffer)
         with replacing(path, sync=True) as file:
@@ -39,7 +39,7 @@ def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] |
     """What `save_checkpoint` wrote; None where there is nothing. No pickled code is run.
 
     Raises:
-        RefuError: the state's "identity" is another one: it is of another training.
+        RefuError: the state's "identity" is another one: the checkpoint is of another training.
         WeightsError: the file is damaged.
     """
     if not os.path.lexists(path):
@@ -52,7 +52,7 @@ def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] |
     if not isinstance(state, dict):
         msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
         raise WeightsError(msg)
-    if identity is not None and state["identity"] != identity:
+    if identity is not None and state.get("identity") != identity:
         msg = f"{path}: of a training with other settings or data; delete it to start anew"
         raise RefuError(msg)
     return state
@@ -61,7 +61,7 @@ def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] |
 def _as_saved(path: Path) -> io.BytesIO:
     """The archive as `torch.save` would have written it: the same records, none of them compressed.
 
-    Torch's own reader takes room for whatever size a damaged record claims. So it gets an archive that was made here.
+    Torch's own reader allocates whatever size a damaged record claims. So it gets an archive that was made here.
     """
     buffer = io.BytesIO()
     with (

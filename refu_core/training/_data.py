@@ -21,14 +21,14 @@ from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, d
 from refu_core.training._mirror import Mirror, mirror_pose
 
 _SPARE = 32
-"""Components that a randomised decomposition finds besides: the last ones that it finds are the least accurate."""
+"""Extra components that a randomised decomposition finds: the last ones that it finds are the least accurate."""
 _SWEEPS = 4
-"""Its power iterations."""
+"""Power iterations of the randomised decomposition."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingSamples:
-    """N bodies and the displacement that their garment has on each."""
+    """N bodies and the displacement of the garment on each."""
 
     pose: Tensor
     """θ that was simulated, rotation vectors [rad], shape (N, 24, 3)."""
@@ -62,7 +62,7 @@ class TrainingSamples:
 
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
-    """A simulated set, what it is of, and the samples of its training split."""
+    """A simulated set, its garment and body, and the samples of its training split."""
 
     garment: GarmentTemplate
     body: SmplBody
@@ -84,17 +84,17 @@ class TrainingSet:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Whose weights those are that are trained on it."""
+        """The garment and body that weights trained on the set are for."""
         return {"garment": self.garment.name, "body_fingerprint": self.body.fingerprint}
 
     @property
     def card(self) -> dict[str, Any]:
-        """What the card of the weights says of the set."""
+        """What the card of the weights says about the set."""
         return {key: self.rows.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")}
 
     @property
     def n_pivots(self) -> int:
-        """Pairs of the plan that have many poses each. Raises `RefuError` for a card that doesn't say how many."""
+        """How many pairs of the plan have many poses each. Raises `RefuError` for a card without a valid number."""
         found = self.rows.card["plan"].get("pivots", SamplePlan.pivots)
         if not isinstance(found, int) or found < 1:
             msg = f"wanted a set whose card says in plan.pivots how many pairs have many poses, got {str(found)[:80]}"
@@ -103,14 +103,14 @@ class TrainingSet:
 
     @property
     def knows_limbs(self) -> bool:
-        """Whether limbs were where they were recorded, beside cloth: sets of old, not on colliders, held them back."""
+        """Whether limbs beside cloth were simulated where recorded: old sets, without colliders, held limbs back."""
         return "gap" in self.rows.card.get("settings", {}).get("drape", {})
 
 
 class TakenAlong:
-    """How far `refu_core.realtime.dress` takes cloth along with skin that gives way, in unposed displacements.
+    """How far `refu_core.realtime.dress` moves cloth along with skin that gives way, in unposed displacements.
 
-    No network has to say that.
+    Networks needn't predict this part.
     """
 
     def __init__(self, body: SmplBody, garment: GarmentTemplate) -> None:
@@ -118,11 +118,11 @@ class TakenAlong:
         self._collider, self._below = Collider(body), SkinBelow.of(garment, body)
 
     def without(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
-        """Of displacements that were simulated (B, N, 3) [m] what a network has to say."""
+        """The part of simulated displacements (B, N, 3) [m] that a network has to predict."""
         return self._moved(displacement, betas, pose, style, -1.0)
 
     def with_it(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
-        """The inverse."""
+        """The inverse of `without`."""
         return self._moved(displacement, betas, pose, style, 1.0)
 
     @torch.no_grad()
@@ -137,7 +137,7 @@ class TakenAlong:
 
 
 def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor:
-    """`of` these arrays, some rows at a time, which bounds the memory; all have N rows, the result too."""
+    """Calls `of` on these arrays, some rows at a time, which bounds the memory; all have N rows, the result too."""
     starts = range(0, max(len(values[0]), 1), size)
     return torch.cat([of(*(value[start : start + size] for value in values)) for start in starts])
 
@@ -145,11 +145,11 @@ def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor
 def read_samples(
     dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate, *, split: str
 ) -> TrainingSamples:
-    """The samples of one split, `train` or `test`, with the poses that were simulated; of sequences, the good frames.
+    """The samples of one split, `train` or `test`, with the simulated poses; of sequences, the frames that were kept.
 
-    Raises `RefuError`: the set is of another garment or body, or the split has no finished sample.
+    Raises `RefuError` when the set is of another garment or body, or the split has no finished sample.
     """
-    _check(dataset, body, garment)
+    check_set(dataset, body, garment)
     rows = np.flatnonzero(dataset.train if split == "train" else dataset.test)
     if not len(rows):
         msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
@@ -175,7 +175,7 @@ def read_samples(
 
 
 def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    """The same of every frame of some sequences that passed the selection; what a sequence is one of, is its pair."""
+    """The same columns for every kept frame of some sequences; a frame's pair is the number of its sequence."""
     kept = dataset.column("cause")[rows] == 0
     found = {name: dataset.column(name)[rows][kept] for name in ("vertices", "pose")}
     found |= {name: dataset.column(name)[rows].repeat(kept.sum(1), axis=0) for name in ("betas", "style")}
@@ -183,7 +183,7 @@ def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDAr
 
 
 def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
-    """The samples as a mirror shows them."""
+    """The mirror images of the samples."""
     return replace(
         samples,
         pose=mirror_pose(samples.pose),
@@ -192,7 +192,7 @@ def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
 
 
 def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tuple[TrainingSamples, TrainingSamples]:
-    """TrainingSamples to learn from and samples to choose by; whole style-shape pairs go to one or the other.
+    """Samples to learn from and samples for validation; whole style-shape pairs go to one or the other.
 
     With a `share` of 0 the validation part is empty.
     """
@@ -201,13 +201,14 @@ def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tu
 
 
 _FEWEST_PAIRS = 5
-"""Of fewer none is held out: those that are left would be too alike to learn from."""
+"""With fewer pairs than this none are held out: the rest would be too similar to learn from."""
 
 
 def drawn_pairs(pair: Tensor, *, share: float, seed: int, fewest: int = _FEWEST_PAIRS) -> Tensor:
     """Which of N samples, of the style-shape pairs `pair` (N,), are chosen: bool, shape (N,).
 
-    Whole pairs are drawn until that share is reached: one at least of `fewest` or more, unless `share` is 0.
+    Whole pairs are drawn as long as they stay within `share`; at least one if there are `fewest` pairs or more, unless
+    `share` is 0.
     """
     known, counts = torch.unique(pair, return_counts=True)
     order = torch.randperm(len(known), generator=torch.Generator().manual_seed(seed))
@@ -218,17 +219,17 @@ def drawn_pairs(pair: Tensor, *, share: float, seed: int, fewest: int = _FEWEST_
 
 
 def output_basis(displacement: Tensor, *, rank: int) -> BasisDecoder:
-    """The basis of the `rank` principal components of displacements (N, V, 3) [m]. Raises `RefuError` as they do."""
+    """The basis of the `rank` principal components of displacements (N, V, 3) [m]. Raises `RefuError` for N < 2."""
     return BasisDecoder(*principal_components(displacement, rank=rank))
 
 
 def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
-    """The mean (V, 3) and the `rank` principal components (R, 3 V) of `values` (N, V, 3); of N of them there are N - 1.
+    """The mean (V, 3) and the `rank` principal components (R, 3 V) of `values` (N, V, 3), at most N - 1.
 
-    Raises `RefuError` for fewer than two.
+    Raises `RefuError` for fewer than two values.
     """
     n = len(values)
-    if n < 2:  # hundreds are needed to learn it well
+    if n < 2:  # to learn it well takes hundreds
         msg = f"an output basis needs 2 samples at least, got {n}: simulate more"
         raise RefuError(msg)
     rank = min(rank, n - 1)
@@ -236,12 +237,12 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     centred = (values - mean).flatten(1)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        # Randomised: an exact decomposition takes 7 s of 3,000 samples, and with their cube, minutes of 12,000.
+        # Randomised: an exact decomposition takes 7 s for 3,000 samples and, growing with the cube, minutes for 12,000.
         _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=_SWEEPS)
     return mean, components[:, :rank].T.contiguous()
 
 
-def _check(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
+def check_set(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
     """Raises `RefuError` for a set that wasn't simulated for this garment on this body."""
     for what, wanted, of_set in (
         ("garment", garment.name, dataset.parts),

@@ -18,17 +18,17 @@ from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
 from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
-from refu_core.training._data import drawn_pairs
+from refu_core.training._data import check_set, drawn_pairs
 from refu_core.training._loop import cosine, is_writer, ranks, start_parallel
 from refu_core.training._progress import TrainingLog
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
 """λ_a, λ_b and λ_c of the paper's loss."""
 BOX = 4.0
-"""Edge of the box around the origin that points are drawn in [m]."""
+"""Edge length of the box around the origin that points are drawn in [m]."""
 _SHARES = (0.25, 0.25, 0.125, 0.125)
-"""Of a body's points, those on its surface, near it, on the garment and near that; the rest is anywhere in the box."""
-_NEAR = 0.02  # [m]; where the error counts
+"""Shares of a body's points on its surface, near it, on the garment and near that; the rest are anywhere in the box."""
+_NEAR = 0.02  # [m]; points closer than this to the skin count as near it
 
 
 @dataclass(frozen=True)
@@ -38,23 +38,23 @@ class SdfSettings:
     preset: str = "paper"
     steps: int = 200_000
     batch_size: int = 32
-    """Bodies a step, over all processes."""
+    """Bodies per step, over all processes."""
     points: int = 4000
-    """Points a body."""
+    """Points per body."""
     learning_rate: float = 1e-5
     noise: float = 0.02
-    """Standard deviation of the disturbance of surface points, each coordinate [m]."""
+    """Standard deviation of the noise added to each coordinate of surface points [m]."""
     check_every: int = 1000
     """Steps between validations, which are also the checkpoints."""
     validation_share: float = 0.05
-    """Of the training split's style-shape pairs, held out whole."""
+    """Share of the training split that is held out, as whole style-shape pairs."""
     seed: int = 0
     is_annealed: bool = False
-    """Whether the learning rate falls to nothing as a cosine; the paper names one rate alone."""
+    """Whether the learning rate falls to zero along a cosine; the paper names only one rate."""
 
     @classmethod
     def of(cls, preset: str) -> SdfSettings:
-        """A preset's own: those of the paper, or what a CPU does in half an hour."""
+        """The settings of a preset: the paper's, or ones that a CPU gets through in half an hour."""
         if preset == "paper":
             return cls()
         return cls(preset, 4000, batch_size=8, points=512, learning_rate=1e-3, check_every=250, is_annealed=True)
@@ -64,7 +64,7 @@ class SdfSettings:
         return self.learning_rate * (cosine(step, self.steps) if self.is_annealed else 1.0)
 
     def __post_init__(self) -> None:
-        """Raises `RefuError` for numbers that make no training."""
+        """Raises `RefuError` for an unknown preset and for invalid numbers."""
         if self.preset not in SDF_PRESETS:
             msg = f"no preset {self.preset!r} of the distance network: wanted one of {', '.join(SDF_PRESETS)}"
             raise RefuError(msg)
@@ -80,7 +80,7 @@ class SdfBatch:
     betas: Tensor
     """Shape (B, 10)."""
     pose: Tensor
-    """Of all joints but the root [rad], shape (B, 23, 3)."""
+    """Rotation vectors of all joints but the root [rad], shape (B, 23, 3)."""
     points: Tensor
     """Shape (B, N, 3); the first S of each body are on its surface (the paper's I_S, the others I_E)."""
     distance: Tensor
@@ -102,6 +102,7 @@ class SdfSampler:
         self._dataset = dataset
         self._body = body
         self._garment = garment
+        self._part = dataset.parts[garment.name]
         self._exact = ExactSdf(body.faces, device=body.device)
 
     def draw(self, generator: torch.Generator, *, bodies: int, points: int, noise: float) -> SdfBatch:
@@ -116,7 +117,7 @@ class SdfSampler:
         betas = torch.from_numpy(np.stack([sample.betas for sample in samples]))
         pose = torch.from_numpy(np.stack([sample.pose for sample in samples]))
         rotation, root = body_frame(self._body, pose, betas)
-        worn = torch.from_numpy(np.stack([sample.vertices for sample in samples]))
+        worn = torch.from_numpy(np.stack([sample.vertices[self._part] for sample in samples]))
         worn = (worn - root[:, None]) @ rotation + root[:, None]
         pose = torch.cat((torch.zeros_like(pose[:, :1]), pose[:, 1:]), 1)
         skins = self._body(pose, betas).vertices
@@ -134,7 +135,7 @@ class SdfSampler:
             normals.append(normal)
         where = torch.stack(drawn)
         distance = query_batch(self._exact, skins, where).distance
-        distance[:, : counts[0]] = 0.0  # by rounding it isn't quite
+        distance[:, : counts[0]] = 0.0  # rounding leaves it slightly off
         return SdfBatch(betas, pose[:, 1:], where, distance, torch.stack(normals))
 
 
@@ -161,8 +162,8 @@ def sdf_loss(distance: Tensor, gradient: Tensor, batch: SdfBatch) -> Tensor:
 
 @torch.no_grad()
 def sdf_figures(network: SdfNetwork, batch: SdfBatch) -> dict[str, float]:
-    """The supplement's figures of a network: mean absolute error [mm] and mean relative error [%], of all points that
-    aren't on the surface; and the mean absolute error within 2 cm of the skin [mm]."""
+    """The supplement's figures of a network: mean absolute error [mm] of all points, mean relative error [%] of those
+    that aren't on the surface; and the mean absolute error within 2 cm of the skin [mm]."""
     found = torch.cat(
         [
             network(points[None], betas[None], pose[None])
@@ -202,16 +203,18 @@ def train_sdf(
 ) -> dict[str, Any]:
     """Trains the network on the training split of a set; writes `output`/sdf-PRESET, a checkpoint, and loss curves.
 
-    Interrupted, it goes on where the last checkpoint was, to the same weights; what is drawn for a step depends on the
-    seed and the number of the step alone. Under `torchrun` every process takes its share of the bodies. On a GPU it
-    computes in bfloat16, weights in float32.
+    If interrupted, it goes on from the last checkpoint and ends with the same weights: what is drawn for a step depends
+    only on the seed and the number of the step. Under `torchrun` every process takes its share of the bodies. On a GPU
+    it computes in bfloat16, with weights in float32.
 
-    Returns what is in the card: settings and figures, on held-out pairs of the training split and on the test split.
+    Returns the card: settings and figures, on held-out pairs of the training split and on the test split.
 
     Raises:
-        RefuError: a checkpoint of another training, a split without samples, or a loss that isn't finite.
+        RefuError: a set of another garment or body, a checkpoint of another training, a split without samples, or a
+            loss that isn't finite.
         WeightsError: a damaged checkpoint, or a disk that can't be written.
     """
+    check_set(dataset, body, garment)
     settings = settings or SdfSettings()
     name = f"sdf-{settings.preset}"
     where = start_parallel(device)
@@ -279,7 +282,7 @@ def train_sdf(
 
 
 def _split(dataset: GarmentDataset, settings: SdfSettings) -> dict[str, Tensor]:
-    """Rows to learn from, to choose by (whole style-shape pairs), and to test on."""
+    """Rows to learn from, to validate on (whole style-shape pairs), and to test on."""
     pairs = torch.as_tensor(dataset.column("pair"))
     train, test = torch.from_numpy(dataset.train), torch.from_numpy(dataset.test)
     held_out = torch.zeros_like(train)

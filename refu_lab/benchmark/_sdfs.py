@@ -1,4 +1,4 @@
-"""The signed distance of all of a garment's vertices to a body in a new pose: ours and others', on one thread."""
+"""Ways to the signed distances of all garment vertices to a body in a new pose: ours and others', on one thread."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, NeuralSdf, Rest
 
 Array = NDArray[np.float32]
 PLAIN_QUERY = "warp refit + query"
-"""What every time is a ratio to: a BVH of the rest pose, refitted to the body and asked for every vertex."""
+"""The unit of all ratios: a BVH of the rest pose is refitted to the body and queried for every vertex."""
 
 
 @wp.kernel(enable_backward=False)
@@ -31,7 +31,7 @@ def plain_kernel(
     distance: wp.array[wp.float32],
     gradient: wp.array[wp.vec3],
 ) -> None:
-    """Warp's own query as its documentation has it: the signed distance [m] and its gradient at `points` [m]."""
+    """Warp's own query as in its documentation: the signed distance [m] and its gradient at `points` [m]."""
     i = wp.tid()
     hit = wp.mesh_query_point_sign_normal(mesh, points[i], 10.0)
     offset = points[i] - wp.mesh_eval_position(mesh, hit.face, hit.u, hit.v)
@@ -48,7 +48,7 @@ class SdfFrame:
     garment: Array
     """Posed garment [m], shape (N, 3)."""
     unposed: Tensor
-    """The garment in the rest pose, β taken off [m], shape (N, 3)."""
+    """The garment in the rest pose without the displacement of β [m], shape (N, 3)."""
     pose: Tensor
     """Shape (24, 3) [rad]."""
     betas: Tensor
@@ -56,19 +56,19 @@ class SdfFrame:
 
 
 Ask = Callable[[SdfFrame], Any]
-"""Signed distances [m], shape (N,), the preparation for the pose included."""
+"""Computes the signed distances [m], shape (N,), including the preparation for the pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class SdfMethod:
-    """One way to the distances."""
+    """One way to compute the distances."""
 
     name: str
     mode: str
     """The pipeline's mode that works this way, or `other`."""
     ask: Ask
     is_slow: bool = False
-    """Takes so long that few calls must do."""
+    """Whether it takes so long that only a few calls are timed."""
 
 
 def sdf_methods(
@@ -76,10 +76,10 @@ def sdf_methods(
 ) -> tuple[list[SdfMethod], dict[str, str]]:
     """All methods whose library is installed, the plain query first; and what to install for the others, by name.
 
-    `network` asks for the paper's, which takes seconds a call on a CPU.
+    `network` adds the paper's network, which takes seconds a call on a CPU.
     """
-    faces, rest = body.faces.cpu().numpy().astype(np.int32), body.v_template.cpu().numpy()
-    methods = [SdfMethod(PLAIN_QUERY, "plain", _plain(faces, rest, device))]
+    faces = body.faces.cpu().numpy().astype(np.int32)
+    methods = [SdfMethod(PLAIN_QUERY, "plain", plain_query(body, device))]
     if device == "cpu":
         methods.append(SdfMethod("band, exact (accurate)", "accurate", _band(body, garment)))
     walk = _ours(ApproxSdf(body, device=device), body, device, rest_faces=RestFaces(body))
@@ -94,14 +94,16 @@ def sdf_methods(
                 missing[name] = f"pip install {package}"
             else:
                 methods.append(SdfMethod(name, "other", make(faces), is_slow=is_slow))
-    if network:  # as it is drawn: what it answers is nothing, what it costs is what it would cost trained
+    if network:  # random weights: its answers mean nothing, but it costs as much as a trained one
         paper = NeuralSdf(SdfNetwork().to(body.device).eval().requires_grad_(False), body)
         name = "paper's network, 9 x 1024, untrained"
         methods.append(SdfMethod(name, "paper", _ours(paper, body, device), is_slow=True))
     return methods, missing
 
 
-def _plain(faces: NDArray[np.int32], rest: Array, device: str) -> Ask:
+def plain_query(body: SmplBody, device: str) -> Ask:
+    """The plain query: a search tree, fitted to each body and asked for the distance of every vertex."""
+    faces, rest = body.faces.cpu().numpy().astype(np.int32), body.v_template.cpu().numpy()
     mesh = wp.Mesh(wp.array(rest, dtype=wp.vec3, device=device), wp.array(faces.ravel(), dtype=wp.int32, device=device))
 
     def ask(frame: SdfFrame) -> Any:
@@ -169,4 +171,4 @@ _OTHERS: tuple[tuple[str, str, str, _Make, bool], ...] = (
     ("libigl signed_distance, pseudo-normal", "igl", "libigl", _libigl, False),
     ("trimesh closest_point", "rtree", "rtree", _trimesh, True),
 )
-"""Name, module that must be there, package that brings it, maker, whether it is slow."""
+"""Name, required module, package that provides it, maker, whether it is slow."""

@@ -1,4 +1,4 @@
-"""The parts of a benchmark: each measures its contenders in turn with the plain query, and adds rows."""
+"""The sections of a benchmark: each measures its contenders in turn with the plain query, and adds rows."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from refu_lab.benchmark._inputs import EncodedFrame, Window
 from refu_lab.benchmark._measure import Timing, measure, processor_clock
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
 from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
-from refu_lab.benchmark._sdfs import PLAIN_QUERY, SdfFrame, sdf_methods
+from refu_lab.benchmark._sdfs import PLAIN_QUERY, SdfFrame, plain_query, sdf_methods
 from refu_lab.commands.benchmark import BenchmarkOptions
 
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]
-"""By backbone and mode, the default backbone, or the one that is there, first."""
+"""By backbone and mode. The default backbone comes first, or the other one if that has no weights."""
 BACKBONES = ("tailornet", "skinned")
 """The default one, and the one that needs no weights."""
 MAIN_MODES = ("hybrid", "accurate")
-"""Of which the stages and persons are measured."""
+"""Modes whose stages are measured, and that are measured with several persons."""
 GRAPH, LAUNCHES = "CUDA graph", "launch by launch"
-"""How a GPU is told what to do in a frame."""
+"""How a frame's work is submitted to a GPU."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """What all sections of a garment share."""
+    """What the sections of one garment on one device share."""
 
     garment: str
     windows: Sequence[Window]
@@ -58,9 +58,8 @@ class Section:
 
     def plain(self) -> Callable[[EncodedFrame], object]:
         """The plain query on this section's device."""
-        garment, body = self.options.on_body(self.garment)
-        methods, _ = sdf_methods(body, garment, network=False, device=self.device)
-        return _of_sdf(methods[0].ask)
+        _, body = self.options.on_body(self.garment)
+        return _of_sdf(plain_query(body, self.device))
 
     def add(self, stage: str, mode: str, timing: Timing, plain: Timing, **facts: Any) -> None:
         """Adds a row."""
@@ -69,14 +68,14 @@ class Section:
         self.result.rows.append(BenchmarkRow.of(timing, plain, stage=stage, mode=mode, **facts))
 
     def add_stages(self, stages: Sequence[Mapping[str, float]], mode: str, plain: Timing, **facts: Any) -> None:
-        """Adds a row a stage, of what it took in each frame [ms]."""
+        """Adds a row for each stage from its times in each frame [ms]."""
         for stage in stages[0]:
             ms = np.array([one[stage] for one in stages])
             self.add(f"frame.{stage}", mode, Timing(ms, ms), plain, **facts)
 
 
 class FrameRunner:
-    """Decodes, dresses and encodes; a frame of several persons is one message a person in, and one out."""
+    """Decodes, dresses and encodes. A frame of several persons takes one message for each and gives one message."""
 
     def __init__(self, pipeline: GarmentPipeline, *, persons: int = 1) -> None:
         self._pipeline, self._persons = pipeline, range(persons)
@@ -92,10 +91,10 @@ class FrameRunner:
         ]
         self._encoder = adapters.MarkerArrayEncoder(meshes)
         self.stages: list[dict[str, float]] = []
-        """What each stage took in each frame that wasn't a jump, by the clock that `time.perf_counter` is [ms]."""
+        """Time of each stage in each frame that wasn't a jump, by whichever clock `time.perf_counter` reads [ms]."""
 
     def __call__(self, moments: EncodedFrame | Sequence[EncodedFrame]) -> bytes:
-        """The message that goes out."""
+        """Returns the output message."""
         given = [moments] if isinstance(moments, EncodedFrame) else moments
         laps = [time.perf_counter()]
         frames = [self._decode(given[i].raw) for i in self._persons]
@@ -133,7 +132,7 @@ def _backbone(pipelines: Pipelines) -> str:
 
 
 def measure_sdfs(section: Section, *, network: bool) -> None:
-    """Every way to the distances, of the same vertices; the paper's `network`, too, where it is asked for."""
+    """Every signed distance at the same vertices, with `network` also the paper's network."""
     garment, body = section.options.on_body(section.garment, device=section.device)
     methods, missing = sdf_methods(body, garment, network=network, device=section.device)
     section.result.missing.update(missing)
@@ -166,7 +165,7 @@ def measure_frames(
 
 
 def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str, str | None], FrameRunner]:
-    """Of every pipeline, by backbone, mode and, of a GPU, method: the main ones are measured without graphs, too."""
+    """A runner for each pipeline, by backbone, mode and (on a GPU) method: the main modes run without graphs, too."""
     on_gpu, backbone = section.device == "cuda", _backbone(pipelines)
     runners = {(*key, GRAPH if on_gpu else None): FrameRunner(pipeline) for key, pipeline in pipelines.items()}
     for mode in MAIN_MODES if on_gpu else ():
@@ -178,7 +177,7 @@ def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str
 
 
 def measure_persons(section: Section, pipelines: Pipelines) -> None:
-    """One message a person in, one message of all out."""
+    """Frames of several persons: one input message for each, one output message for all."""
     counts, backbone = section.options.sizes.persons, _backbone(pipelines)
     windows = section.windows
     crowd = [
@@ -198,12 +197,12 @@ def measure_persons(section: Section, pipelines: Pipelines) -> None:
 
 
 def measure_still(section: Section, pipelines: Pipelines) -> None:
-    """The same pose again and again, beside one that moves: the whole frame, and the pipeline alone."""
+    """An unchanging pose beside a moving one: the whole frame, and the pipeline alone."""
     contenders: dict[str, Callable[[EncodedFrame], object]] = {PLAIN_QUERY: section.plain()}
     backbone, held = _backbone(pipelines), section.windows[0][1]
     for mode in MAIN_MODES:
         moving = pipelines[backbone, mode]
-        # A pipeline of its own: one that moves would make the other's pose a new one.
+        # It needs a pipeline of its own: in a shared one, frames of the moving pose would come between.
         still = section.options.load_pipeline(section.garment, mode=mode, backbone=backbone, device=section.device)
         contenders[f"{mode} moving"] = FrameRunner(moving)
         contenders[f"{mode} still"] = _always(FrameRunner(still), held)
@@ -219,7 +218,7 @@ def measure_still(section: Section, pipelines: Pipelines) -> None:
 
 
 def measure_paper(section: Section, pipelines: Pipelines) -> None:
-    """The paper's structure, frame by frame, on a GPU in half precision, too."""
+    """The paper's structure, frame by frame; on a GPU also in half precision."""
     full = section.options.sizes.has_network
     types = (torch.float32, torch.bfloat16, torch.float16) if section.device == "cuda" else (torch.float32,)
     for dtype in types:
@@ -243,7 +242,7 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
 def load_pipelines(
     garment: str, options: BenchmarkOptions, *, device: str = "cpu"
 ) -> tuple[dict[tuple[str, str], GarmentPipeline], dict[str, str]]:
-    """The pipelines of a garment by (backbone, mode), the default backbone first; and what keeps others away."""
+    """The pipelines of a garment by (backbone, mode), the default backbone first; and how to train the missing ones."""
     pipelines: dict[tuple[str, str], GarmentPipeline] = {}
     missing: dict[str, str] = {}
     for backbone, mode in product(BACKBONES, options.sizes.modes):

@@ -1,4 +1,4 @@
-"""What the commands share: types of arguments, common options, exit codes, the JSON file."""
+"""What the commands share: argument types, common options, exit codes, the JSON file."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.modes import BetasSource
 from refu_core.options import Spec, setting, specs_of
+from refu_lab.tables import write_json
 
 Number = TypeVar("Number", int, float)
 
@@ -27,19 +28,19 @@ _MOST = 10**9
 
 
 class Parser(argparse.ArgumentParser):
-    """Whose errors are one line, as for every other kind of bad input, and whose numbers may be negative."""
+    """A parser that reports errors in one line, as for any other bad input, and that takes negative numbers."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse's own takes -1,0 for an option
 
     def error(self, message: str) -> NoReturn:
-        """Ends the program."""
+        """Prints the error and ends the program."""
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
 
 
 def names(text: str) -> tuple[str, ...]:
-    """`A,B`: one name at least."""
+    """Parses `A,B`: at least one name."""
     found = tuple(name.strip() for name in text.split(",") if name.strip())
     if not found:
         msg = "wanted one name or several with commas between them"
@@ -48,7 +49,7 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
-    """`X,Y,...`: up to `count` of them; the rest are zero."""
+    """A parser of `X,Y,...`: up to `count` numbers, the rest are zero."""
 
     def parse(text: str) -> tuple[float, ...]:
         try:
@@ -69,17 +70,17 @@ def positive(text: str) -> int:
 
 
 def seed(text: str) -> int:
-    """A whole number that random numbers may start from."""
+    """A whole number that can be a random seed."""
     return _number(int, text, 0, _MOST)
 
 
 def port(text: str) -> int:
-    """A number that something may listen at."""
+    """A port number."""
     return _number(int, text, 1, 65_535)
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
-    """A number from `low` to `high`."""
+    """A parser of a number from `low` to `high`."""
     return lambda text: _number(float, text, low, high)
 
 
@@ -96,7 +97,7 @@ def _number(kind: type[Number], text: str, low: float, high: float) -> Number:
 
 
 def in_path(text: str) -> Path:
-    """The path of something that is read: whether it's there, its reader says."""
+    """The path of something to read; its reader checks whether it exists."""
     try:
         os.fsencode(text)
     except UnicodeError:
@@ -108,12 +109,12 @@ def in_path(text: str) -> Path:
 
 
 def out_file(text: str) -> Path:
-    """The path of a file that is written: what is there already is a file."""
+    """The path of a file to write; whatever exists there must be a file."""
     return _output(text, "a file", stat.S_ISREG)
 
 
 def out_picture(text: str) -> Path:
-    """The path of a picture that is written: of another suffix, it may be something else than a picture."""
+    """The path of a picture to write; with a suffix other than .png it could be some other file."""
     found = out_file(text)
     if found.suffix.lower() != ".png":
         msg = f"wanted a name that ends in .png, got {printable(text)}"
@@ -122,12 +123,12 @@ def out_picture(text: str) -> Path:
 
 
 def out_folder(text: str) -> Path:
-    """The path of a folder that is written to: what is there already is a folder."""
+    """The path of a folder to write to; whatever exists there must be a folder."""
     return _output(text, "a folder", stat.S_ISDIR)
 
 
 def out_bag(text: str) -> Path:
-    """The path of a bag that is written, a file or a folder."""
+    """The path of a bag to write, a file or a folder."""
     return _output(text, "a file or a folder", lambda mode: stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
@@ -147,7 +148,7 @@ def _output(text: str, wanted: str, is_wanted: Callable[[int], bool]) -> Path:
 
 
 def word(text: str) -> str:
-    """Text that a message may hold."""
+    """Text that can be sent in a message."""
     try:
         text.encode()
     except UnicodeError:
@@ -159,14 +160,14 @@ def word(text: str) -> str:
 
 
 def add_common(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], int]) -> None:
-    """What every command has; `run` does its work."""
+    """Adds what every command has; `run` does the command's work."""
     parser.set_defaults(run=run)
     parser.add_argument("--json", type=out_file, metavar="FILE", help="write the results as JSON")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def add_options(parser: argparse.ArgumentParser, options: type) -> None:
-    """An option for each field of a dataclass that says what it is for (`refu_core.options.setting`)."""
+    """Adds an option for each described field of a dataclass (`refu_core.options.setting`)."""
     for name, spec in specs_of(options).items():
         flag, told = f"--{name.replace('_', '-')}", dict[str, Any](dest=name, default=None, help=_help(spec))
         if isinstance(spec.default, bool):
@@ -202,12 +203,12 @@ def place(text: str) -> str:
 
 
 def place_for(kind: Callable[[str], Path]) -> Callable[[str], str]:
-    """A path that is written to, as `kind` takes it, or a URL."""
+    """A parser of an output: a path, checked by `kind`, or a URL."""
     return lambda text: word(text) if "://" in text else str(kind(text))
 
 
 def axes_of(what: str, frame: str) -> Any:
-    """The setting of commands that read files of motion: how their numbers are meant."""
+    """A setting of commands that read motion files: the axes that their numbers are in."""
     return setting(
         "auto",
         f"axes of the {what} root: inferred from the people, and reported (auto); y up (smpl); z-up (AMASS); y-down (a "
@@ -217,14 +218,14 @@ def axes_of(what: str, frame: str) -> Any:
 
 
 def rate_of_files() -> Any:
-    """The setting of commands that read files of motion: at what rate."""
+    """A setting of commands that read motion files: their frame rate."""
     return setting(
         None, "frame rate of motion files, in place of their own", parse=between(0.001, 10_000), metavar="HZ"
     )
 
 
 def worn_by() -> Any:
-    """The setting of commands that dress bodies: whose betas, and whose skin."""
+    """A setting of commands that dress bodies: which body that is."""
     return setting(
         None,
         "body to dress: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
@@ -235,17 +236,17 @@ def worn_by() -> Any:
 
 
 def off_collider() -> Any:
-    """The setting of commands that dress bodies: what collisions are resolved against."""
+    """A setting of commands that dress bodies: what collisions are resolved against."""
     return setting(True, "resolve collisions against the collider, or (--no-collider) against the raw posed body")
 
 
 def seeded() -> Any:
-    """The setting of commands that draw."""
+    """A setting of commands that draw random numbers."""
     return setting(0, "random seed", parse=seed, metavar="S")
 
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:
-    """What every command has that shares its work."""
+    """Adds what every command has that spreads its work over processes."""
     parser.add_argument(
         "--jobs", type=positive, metavar="N", help="local processes, one thread each (1; more need the extra cluster)"
     )
@@ -258,7 +259,7 @@ def add_cluster(parser: argparse.ArgumentParser) -> None:
 
 
 def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
-    """The arguments that are fields of a dataclass of options, by name; what wasn't given is left to its defaults."""
+    """The given arguments that are fields of a dataclass, by name; the rest is left to its defaults."""
     known = {field.name for field in fields(options)}
     named = {name: value for name, value in vars(args).items() if name in known and value is not None}
     if "betas" in named and named.setdefault("betas_source", BetasSource.FIXED) != BetasSource.FIXED:
@@ -268,7 +269,7 @@ def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
 
 
 def require_use(args: argparse.Namespace, needed: Mapping[str, str]) -> None:
-    """Raises `RefuError` for an option that was given without the other one that it is `needed` for."""
+    """Raises `RefuError` for an option given without the one it depends on; `needed` maps the former to the latter."""
     for name, other in needed.items():
         if getattr(args, name) is not None and not getattr(args, other):
             msg = f"--{name.replace('_', '-')} is of no use without --{other}: give both, or leave it out"
@@ -276,9 +277,9 @@ def require_use(args: argparse.Namespace, needed: Mapping[str, str]) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raises `RefuError` before the work is done where its result couldn't be written.
+    """Raises `RefuError` if a result couldn't be written, before the work is done.
 
-    A file is written beside its place and then put there, so its folder must be writable, too.
+    A file is first written beside its final place, so its folder must be writable, too.
     """
     folder = path.absolute() if path.is_dir() else path.absolute().parent
     while not folder.exists():
@@ -292,7 +293,7 @@ def check_writable(path: Path) -> None:
 
 
 def require_distinct(written: Mapping[str, Path]) -> None:
-    """Raises `RefuError` where two options would write to one place."""
+    """Raises `RefuError` if two options would write to the same place."""
     places: dict[str, str] = {}
     for option, path in written.items():
         other = places.setdefault(os.path.realpath(path), option)
@@ -302,18 +303,16 @@ def require_distinct(written: Mapping[str, Path]) -> None:
 
 
 def require_apart(given: Path, written: Path) -> None:
-    """Raises `RefuError` where what is `written` would take the place of what was `given`, or be a part of it."""
-    here, there = (Path(os.path.realpath(path)) for path in (given, written))  # links that go in a circle, too
+    """Raises `RefuError` if the output `written` is the input `given`, or one of them lies in the other."""
+    here, there = (Path(os.path.realpath(path)) for path in (given, written))  # also for links that go in a circle
     if here == there or there in here.parents or here in there.parents:
         msg = f"{written}: would be written over the input {given}; name another place"
         raise RefuError(msg)
 
 
 def tell(args: argparse.Namespace, text: str, content: dict[str, Any], *, code: int = 0) -> int:
-    """Writes the result as JSON where that was asked for, prints it, and gives the exit code back."""
+    """Writes the result as JSON if that was asked for, prints its text, and returns the exit code."""
     if args.json is not None:
-        from refu_lab.tables import write_json  # loads what tables are of
-
         write_json(args.json, content)
-    print(text)  # last: who reads it may have gone (| head)
+    print(text)  # last: its reader may be gone (| head)
     return code

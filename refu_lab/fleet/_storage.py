@@ -1,14 +1,13 @@
-"""Where results are kept: a folder of this machine or, by fsspec, any other that a URL names.
+"""Where results are kept: a folder on this machine or, through fsspec, any other that a URL names.
 
-A result is written elsewhere first and then put into its place in one step: a reader, or a run that goes on where this
-one was ended, finds all of it or nothing.
+A result is written elsewhere first and then put into its place in one step (a folder at a URL file by file): a reader,
+or a run that resumes this one, finds all of it or nothing.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import tempfile
 import uuid
@@ -22,16 +21,16 @@ from refu_core import RefuError
 from refu_core._files import exclusive, parse_json
 
 SCRATCH = ".partial"
-"""Folder of what isn't finished."""
+"""Name of the folder for unfinished results."""
 
 
 def is_url(text: str) -> bool:
-    """Whether a text names a place by protocol, s3:// or gs:// say."""
+    """Whether a text has a protocol, such as s3:// or gs://."""
     return "://" in text
 
 
 def filesystem(place: str) -> tuple[Any, str]:
-    """fsspec's file system of a path or URL, and the path in it. Raises `RefuError` for a protocol that isn't there."""
+    """fsspec's file system for a path or URL, and the path in it. Raises `RefuError` for an unknown protocol."""
     import fsspec
 
     try:
@@ -44,7 +43,7 @@ def filesystem(place: str) -> tuple[Any, str]:
 
 @contextmanager
 def fetched(source: str) -> Iterator[Path]:
-    """A file or folder, on this machine. Raises `RefuError` where a URL can't be read."""
+    """A file or folder as a path on this machine. Raises `RefuError` if a URL can't be read."""
     if not is_url(source):
         yield Path(source)
         return
@@ -61,17 +60,17 @@ def fetched(source: str) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder by path or URL. Whatever can't be read or written raises `RefuError`."""
+    """A folder by path or URL. Raises `RefuError` for whatever can't be written."""
 
     place: str
 
     def at(self, name: str) -> str:
-        """Path or URL of what is called so in it."""
+        """Path or URL of something in it."""
         return f"{self.place.rstrip('/')}/{name}"
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:
-        """An empty folder of this machine; what is left in it when the block is left is gone."""
+        """An empty folder on this machine, deleted with its content when the block ends."""
         with self._errors():
             if is_url(self.place):
                 own = Path(tempfile.mkdtemp(prefix="refu-"))
@@ -84,7 +83,7 @@ class Folder:
             shutil.rmtree(own, ignore_errors=True)
 
     def put(self, path: Path, name: str) -> None:
-        """Puts a file or folder of `scratch` into its place; what was there is replaced."""
+        """Moves a file or folder from `scratch` into its place, replacing what was there."""
         with self._errors():
             if is_url(self.place):
                 fs, there = filesystem(self.at(name))
@@ -101,18 +100,18 @@ class Folder:
             path.replace(place)
 
     def put_text(self, text: str, name: str) -> None:
-        """Writes a file."""
+        """Writes a text file."""
         with self.scratch() as folder:
             file = folder / "text"
             file.write_text(text, encoding="utf-8")
             self.put(file, name)
 
     def put_json(self, content: Any, name: str) -> None:
-        """Writes plain values."""
+        """Writes plain values as JSON."""
         self.put_text(json.dumps(content, indent=1, allow_nan=False) + "\n", name)
 
     def read_json(self, name: str) -> Any:
-        """Plain values; None where there are none, or they can't be read."""
+        """Reads plain values; None if the file is missing or can't be read."""
         fs, path = filesystem(self.at(name))
         try:
             return parse_json(fs.cat_file(path))
@@ -120,7 +119,7 @@ class Folder:
             return None
 
     def start(self, name: str) -> bytes | None:
-        """The first 64 bytes of a file; None where there is none."""
+        """The first 64 bytes of a file; None if it doesn't exist, empty if it can't be read."""
         fs, path = filesystem(self.at(name))
         try:
             return bytes(fs.cat_file(path, 0, 64))
@@ -130,7 +129,7 @@ class Folder:
             return b""
 
     def size(self, name: str) -> int | None:
-        """Of a file [bytes]; None where there is none."""
+        """Size of a file [bytes]; None if it doesn't exist."""
         fs, path = filesystem(self.at(name))
         try:
             return int(fs.size(path))
@@ -139,9 +138,9 @@ class Folder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keeps other runs out, of this machine's folders; the lock goes with the process, however that ends.
+        """Keeps other runs out of a folder on this machine; the lock ends with the process, however that ends.
 
-        Afterwards what runs that were killed have left unfinished is removed.
+        Afterwards, unfinished results are removed, including those of runs that were killed.
         """
         if is_url(self.place):
             yield
@@ -151,13 +150,11 @@ class Folder:
         with contextlib.ExitStack() as stack:
             with self._errors():
                 folder.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(exclusive(folder / ".lock", error=RefuError(msg)))
+                stack.enter_context(exclusive(folder / ".lock", error=RefuError(msg), is_kept=False))
             try:
                 yield
             finally:
                 shutil.rmtree(folder / SCRATCH, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            os.unlink(folder / ".lock")  # noqa: PTH108
 
     @contextmanager
     def _errors(self) -> Iterator[None]:

@@ -1,9 +1,9 @@
-"""The tables over test samples, made of the runs."""
+"""Makes the tables over test samples from the runs."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from refu_lab.reproduction._tables import ALL, Missing, ResultRow, ResultTable, 
 ENERGY_ZOOM = 2.5e-3
 """Upper end of the paper's zoomed histogram [m²]."""
 UNSEEN_GROUPS = 5
-"""Groups of equally many samples, by distance to the training set."""
+"""Number of groups of equally many samples, by distance to the training set."""
 
 Values = Mapping[str, float | None]
 _MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
@@ -30,23 +30,23 @@ class SampleTable:
     title: str
     about: str
     methods: tuple[str, ...]
-    """In the order of the rows."""
+    """Methods in the order of the rows."""
     metrics: tuple[str, ...] = _MAIN
-    """Those that a method has without a run, too: there, they are None."""
+    """Metrics that a method without a run has, too, as None."""
     values: Callable[[MethodRun], Values] | None = None
-    """What a run gives by metric; by default the fields of `Figures`."""
+    """Gives a run's values by metric; by default those are the fields of `Figures`."""
     is_summed: bool = True
-    """Whether there are rows of all garments."""
+    """Whether there are rows over all garments together."""
 
     def of(self, run: MethodRun | None) -> Values:
-        """The figures of one method on one garment's samples."""
+        """The figures of one method's run on one garment's samples."""
         if run is None:
             return dict.fromkeys(self.metrics)
         return self.values(run) if self.values else {metric: getattr(run.figures, metric) for metric in self.metrics}
 
 
 def sample_table(study: Study, name: str) -> ResultTable:
-    """A table of `SAMPLE_TABLES`, garment by garment and, where there are several, over all of them."""
+    """A table of `SAMPLE_TABLES`, garment by garment and, if there are several, over all of them."""
     spec = SAMPLE_TABLES[name]
     table = ResultTable(name, spec.title, spec.about)
     for garment in study.n_samples:
@@ -57,14 +57,19 @@ def sample_table(study: Study, name: str) -> ResultTable:
         table.rows += _over_all(study, table, spec.methods, spec.metrics)
     if name == "comparison":
         table.rows += list(_trends(table))
-    table.missing = [missing for missing in study.missing.values() if missing.method in spec.methods]
+    table.missing = _missing_of(study, spec.methods)
     if name == "sequence":
         table.missing += _missing_sets(study)
     return table
 
 
+def _missing_of(study: Study, methods: Iterable[str]) -> list[Missing]:
+    """Those of a table's methods that couldn't be run."""
+    return [missing for missing in study.missing.values() if missing.method in set(methods)]
+
+
 def _missing_sets(study: Study) -> Iterator[Missing]:
-    """The methods that there was no set of sequences for."""
+    """The methods for which no set of sequences was given."""
     for garment, shapes in itertools.product(study.n_samples, SEQUENCE_SHAPES):
         command = f"refu simulate {garment} --sequences --shapes {shapes} --count N --output DIR"
         for method in (f"mlp-{shapes}", f"mlp-{shapes}-refu-approx"):
@@ -73,7 +78,7 @@ def _missing_sets(study: Study) -> Iterator[Missing]:
 
 
 def _missing_postures(study: Study) -> Iterator[Missing]:
-    """The node, of each garment whose samples are in none of the postures."""
+    """The node's method, for each garment none of whose samples is in a posture."""
     method = POSTURE_METHODS[-1]
     for garment in study.n_samples:
         run = study.runs.get((garment, method))
@@ -91,7 +96,7 @@ def posture_table(study: Study) -> ResultTable:
         "it: arms on the body, overhead, crossed, sitting, kneeling, on all fours. MPVE beside that of all these "
         "samples says in which of them the networks are at a loss.",
     )
-    table.missing = [*study.missing.values(), *_missing_postures(study)]
+    table.missing = [*_missing_of(study, POSTURE_METHODS), *_missing_postures(study)]
     found = {garment: [study.runs.get((garment, name)) for name in POSTURE_METHODS] for garment in study.n_samples}
     if len(found) > 1:
         found[ALL] = [MethodRun.joined(ALL, name, study.pooled(name)) for name in POSTURE_METHODS]
@@ -131,12 +136,12 @@ def time_table(study: Study) -> ResultTable:
             ms = None if run is None else run.median_ms(*parts)
             table.rows.append(ResultRow.of("time", garment, name, "ms", ms))
     table.rows += _over_all(study, table, tuple(_COMPONENTS), ("ms",))
-    table.missing = list(study.missing.values())
+    table.missing = _missing_of(study, TIMED_METHODS)
     return table
 
 
 def _over_all(study: Study, table: ResultTable, methods: Sequence[str], metrics: Sequence[str]) -> Iterator[ResultRow]:
-    """The means of several garments, weighted by their samples."""
+    """The means over several garments, weighted by their numbers of samples."""
     if len(study.n_samples) > 1:
         for method, metric in itertools.product(methods, metrics):
             mean = weighted((table.value(g, method, metric), n) for g, n in study.n_samples.items())
@@ -144,7 +149,7 @@ def _over_all(study: Study, table: ResultTable, methods: Sequence[str], metrics:
 
 
 def _trends(table: ResultTable) -> Iterator[ResultRow]:
-    """The changes against the backbone alone [%], of all methods that handle collisions."""
+    """The changes against the backbone alone [%], for all other methods but the skinned template."""
     for row in list(table.rows):
         base = table.value(row.garment, "tailornet", row.metric)
         if row.method not in ("skinned", "tailornet"):
@@ -153,7 +158,7 @@ def _trends(table: ResultTable) -> Iterator[ResultRow]:
 
 
 def _alpha_values(run: MethodRun) -> Values:
-    """The main figures, and of ReFU its mean α by how wrong the distance is that it sees."""
+    """The main figures and, for ReFU, its mean α by how wrong its distance is."""
     values = {metric: getattr(run.figures, metric) for metric in _MAIN}
     groups = zip(itertools.pairwise(RATIO_EDGES), run.scales.count, run.scales.total, strict=True)
     for (low, high), count, total in groups if run.method == "refu-approx" else ():
@@ -180,7 +185,7 @@ def _unseen_values(run: MethodRun) -> Values:
 
 
 def unseen_groups(runs: Sequence[MethodRun]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(distances, collision errors [mm]) of equally many samples each, by distance; none for unknown distances."""
+    """(distances, collision errors [mm]) of groups of equally many samples by distance; none if one is unknown."""
     distance = np.array([d for run in runs for d in run.unseen])
     if not len(distance) or not np.isfinite(distance).all():
         return []
@@ -190,7 +195,7 @@ def unseen_groups(runs: Sequence[MethodRun]) -> list[tuple[np.ndarray, np.ndarra
 
 
 POSTURE_METHODS = ("tailornet", "node-hybrid")
-"""What must be run for the table of postures."""
+"""Methods that the table of postures needs."""
 _SDFS = ("approx", "accurate")
 _MODES = (*_SDFS, "hybrid")
 _OPTIMISATIONS = (
@@ -288,7 +293,7 @@ SAMPLE_TABLES: Mapping[str, SampleTable] = {
         is_summed=False,
     ),
 }
-"""The tables over test samples, but for that of times."""
+"""The tables over test samples, without those of postures and times."""
 
 _COMPONENTS: Mapping[str, tuple[str, ...]] = {
     "sdf-approx": ("approximate SDF", "refu-hybrid", "sdf"),
@@ -313,6 +318,6 @@ _COMPONENTS: Mapping[str, tuple[str, ...]] = {
         "post-process",
     ),
 }
-"""Component: its label, the method that has it, parts of that method's time."""
+"""For each component its label, the method that has it, and the parts of that method's time."""
 TIMED_METHODS = tuple(dict.fromkeys(method for _, method, *_ in _COMPONENTS.values()))
-"""What must be run for the table of times."""
+"""Methods that the table of times needs."""

@@ -1,4 +1,4 @@
-"""Numbers: float32 against float64, over frames and points that people and senders make."""
+"""Numbers: float32 against float64, for all kinds of frames and points."""
 
 from __future__ import annotations
 
@@ -13,25 +13,22 @@ from refu_lab.stress._subject import Subject, distance_to_mesh
 from refu_lab.stress._trial import Measurement, Trial
 
 ROUNDING = 5e-6
-"""What float32 may cost a body of a metre or two [m]: fifty times its resolution there."""
+"""Rounding error allowed for float32 on a body of a metre or two [m]: fifty times its resolution there."""
 COLLIDER_ROUNDING = 2e-5
-"""The same with the collider [m], whose ways between two surfaces are quotients of short distances. In everyday poses
-alone: where joints are turned as no body's can be, rounding may decide which of two sides is nearer."""
-PIVOTS = 2e-3
-"""Share of the largest displacement that pivots which weigh 0.1 % may make: they may point the other way."""
+"""The same with the collider [m], which divides short distances between two surfaces. It holds in everyday poses only:
+where joints turn as in no real body, rounding may decide which of two sides is nearer."""
 _DISTANCE_ROUNDING = 2e-6
 _POINTS = 24
 _UNIT = 1e-3
-"""How far from one the length of a gradient may be."""
+"""How far the length of a gradient may be from one."""
 _COLLAPSED = 40
-"""Faces whose corners are put in one place."""
+"""Number of faces whose corners are put in one place or in line."""
 
 
 def against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """Bodies and garments before collision handling, in float32 and in float64; and the pipeline for the first frame.
+    """Compares bodies and garments before collision handling in float32, the first also by the pipeline, with float64.
 
-    The limit grows with the size of what is computed, and with the angles: float32 holds 1,000 rad to 6e-5. What
-    TailorNet leaves out of its mixture in a pipeline, a thousandth of a displacement, is no matter of precision.
+    The limit grows with the size of the result and with the angles: float32 resolves 1,000 rad to 6e-5.
     """
     yield from _compared(subject.on_skin, trial, ROUNDING)
     out = subject.pipeline(trial.frames[0])
@@ -41,7 +38,7 @@ def against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def collider_against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The same with the collider, and garments on it."""
+    """The same with the collider, and with garments on it."""
     yield from _compared(subject, trial, COLLIDER_ROUNDING)
 
 
@@ -49,13 +46,12 @@ def _compared(subject: Subject, trial: Trial, rounding: float) -> Iterator[Measu
     out = subject.pipeline(trial.frames[0])
     first = [out.body, *(mesh.raw for mesh in out.values())]
     ours, wanted = subject.in_float32(trial.frames), subject.in_float64(trial.frames)
-    left_out = PIVOTS * subject.in_float64.largest_displacement
     turn = 1 + np.array([np.linalg.norm(frame.pose, axis=1).max() for frame in trial.frames]) / np.pi
     deviation = np.zeros(len(trial.frames))
     limit = np.zeros_like(deviation)
     for got, whole, right in zip(ours, first, wanted, strict=True):
         error = np.abs(got - right).max((1, 2))
-        error[0] = max(error[0], np.abs(whole - right[0]).max() - left_out)
+        error[0] = max(error[0], np.abs(whole - right[0]).max())
         limit = np.maximum(limit, rounding * turn * np.abs(right).max((1, 2), initial=1.0))
         deviation = np.maximum(deviation, error)
     for i in range(len(trial.frames)):
@@ -64,7 +60,7 @@ def _compared(subject: Subject, trial: Trial, rounding: float) -> Iterator[Measu
 
 
 def n_not_finite(*arrays: NDArray[np.floating]) -> int:
-    """How many numbers of all arrays are NaN or infinite."""
+    """How many numbers in the arrays are NaN or infinite."""
     return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
 
 
@@ -72,7 +68,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Place = Callable[[F32, I64, np.random.Generator], F64]
-"""Points to ask for, (N, 3), around a body's vertices (V, 3) and faces (F, 3); it may move the vertices."""
+"""Makes query points (N, 3) around a body's vertices (V, 3) and faces (F, 3); it may move the vertices."""
 
 
 def _on_faces(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
@@ -93,7 +89,7 @@ def _mixed(vertices: F32, faces: I64, weights: F64) -> F64:
 
 
 def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
-    """Half-way between the skin and the skin across, where the gradient turns round."""
+    """Points half-way between the skin and the skin opposite, where the gradient flips."""
     chosen = faces[rng.integers(len(faces), size=_POINTS)]
     a, b, c = vertices[chosen].astype(np.float64).transpose(1, 0, 2)
     inward = -np.cross(b - a, c - a)
@@ -101,7 +97,7 @@ def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     start = (a + b + c) / 3
     sdf = ExactSdf(faces)
     sdf.update(torch.from_numpy(vertices))
-    # Bisect for the depth at which another part of the skin becomes as near as the one overhead.
+    # Bisect for the depth at which another part of the skin becomes as near as the part above.
     low, high = np.zeros(_POINTS), np.full(_POINTS, 0.3)
     for _ in range(20):
         middle = (low + high) / 2
@@ -113,7 +109,7 @@ def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
 
 
 def _hair(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
-    """A hair's breadth off the skin, on either side, down to less than float32 resolves."""
+    """Points a hair's breadth off the skin on either side, down to less than float32 resolves."""
     return _on_faces(vertices, faces, rng) + rng.normal(size=(_POINTS, 3)) * 10.0 ** rng.uniform(-40, -4, (_POINTS, 1))
 
 
@@ -122,7 +118,7 @@ def _far(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
 
 
 def _without_area(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
-    """Around faces whose corners are in one place, or in one line."""
+    """Points around faces whose corners are in one place, or in line."""
     chosen = faces[rng.integers(len(faces), size=_COLLAPSED)]
     vertices[chosen[::2, 1]] = vertices[chosen[::2, 0]]
     vertices[chosen[::2, 2]] = vertices[chosen[::2, 0]]
@@ -138,14 +134,14 @@ POINTS: dict[str, Place] = {
     "far away": _far,
     "faces without area": _without_area,
 }
-"""Kinds of points to ask for, by name."""
+"""Kinds of query points, by name."""
 
 
 def distances(place: Place) -> Callable[[Subject, Trial], Iterator[Measurement]]:
-    """Measures all signed distances at such points."""
+    """A check that measures all signed distances at such points."""
 
     def measure(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-        """Against every triangle in float64; the approximate one must not be less than that."""
+        """Compares distances with those to all triangles in float64; the approximate one must not be smaller."""
         rng = np.random.default_rng(trial.seed)
         body, frame = subject.pipeline.body, trial.frames[0]
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The pipeline under test, and all that its results are held against."""
+"""The pipeline under test, and the references that its results are compared with."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf
 
 @dataclass(frozen=True, kw_only=True)
 class Wardrobe:
-    """Garments of one body, and how they are predicted."""
+    """Garments for one body, and how they are predicted."""
 
     garments: tuple[str, ...]
     backbone: str = "skinned"
@@ -33,10 +33,10 @@ class Wardrobe:
 
 
 class Subject:
-    """One wardrobe's pipeline and its references, each made when it is first asked for."""
+    """One wardrobe's pipeline and its references, each made at first use."""
 
     def __init__(self, wardrobe: Wardrobe, *, weights: Path | None = None, collider: bool = True) -> None:
-        """Loads the pipeline; raises as `GarmentPipeline.load`."""
+        """Loads the pipeline; raises what `GarmentPipeline.load` raises."""
         self.wardrobe = wardrobe
         self._weights, self._collider = weights, collider
         self.pipeline = self.load()
@@ -47,7 +47,7 @@ class Subject:
         return Subject(self.wardrobe, weights=self._weights, collider=False)
 
     def load(self, *garments: str) -> GarmentPipeline:
-        """A pipeline that has never seen a frame, of these garments or all."""
+        """A pipeline that has never seen a frame, for these garments or all."""
         return GarmentPipeline.load(
             garments or self.wardrobe.garments,
             backbone=self.wardrobe.backbone,
@@ -58,7 +58,7 @@ class Subject:
 
     @property
     def one_by_one(self) -> dict[str, GarmentPipeline]:
-        """A pipeline for each garment: worn together, they are lifted off each other, too."""
+        """A pipeline for each garment alone: worn together, they would also be lifted off each other."""
         names = self.wardrobe.garments
         return self._alone if len(names) > 1 else {names[0]: self.pipeline}
 
@@ -79,7 +79,7 @@ class Subject:
 
     @cached_property
     def contact_stage(self) -> ContactStage:
-        """Collision handling as the pipeline does it; by the exact distance where the pipeline does nothing."""
+        """Collision handling as in the pipeline; with the exact distance if the pipeline has none."""
         mode = SdfMode(self.wardrobe.sdf)
         return ContactStage(self.pipeline.outfit, sdf=SdfMode.ACCURATE if mode is SdfMode.NONE else mode)
 
@@ -90,7 +90,7 @@ class Subject:
 
     @cached_property
     def in_float64(self) -> Prediction:
-        """The same in float64: what float32 is held against."""
+        """The same in float64, as the reference for float32."""
         return Prediction(self.pipeline.outfit, torch.float64)
 
 
@@ -98,14 +98,12 @@ class Prediction:
     """Body, backbone and posed garment in one precision."""
 
     def __init__(self, outfit: Outfit, dtype: torch.dtype) -> None:
-        """Of the bodies and garments of `outfit`, with networks of its own."""
+        """For the body and garments of `outfit`, with its own copy of the networks."""
         self._outfit, self._dtype = outfit.to(dtype), dtype
-        self.largest_displacement = 0.0
-        """Largest coordinate of a backbone's displacement in the last call [m]."""
 
     @torch.no_grad()
     def __call__(self, frames: Sequence[SmplFrame]) -> list[NDArray[np.floating]]:
-        """Bodies, and each garment before collision handling [m], shapes (B, V, 3), of B frames."""
+        """The bodies, then each garment before collision handling, in B frames [m], shape (B, V, 3) each."""
         none = np.zeros(N_STYLES, np.float32)
         pose, betas, style = (
             torch.as_tensor(np.stack(values)).to(self._dtype)
@@ -117,21 +115,18 @@ class Prediction:
         )
         wearer = Wearer.of(self._outfit, betas, style if any(frame.style is not None for frame in frames) else None)
         dressed = dress(pose, wearer)
-        drapes = dressed.drapes
-        added = [drapes[name].unposed - garment.rest for name, garment in wearer.garments.items()]
-        self.largest_displacement = max(float(one.abs().max()) for one in added)
         return [
             torch.stack([turn(one) for turn, one in zip(dressed.turns, found, strict=True)]).numpy()
-            for found in (dressed.body, *(drape.vertices for drape in drapes.values()))
+            for found in (dressed.body, *(drape.vertices for drape in dressed.drapes.values()))
         ]
 
 
 def distance_to_mesh(
     points: NDArray[np.floating], vertices: NDArray[np.floating], faces: NDArray[np.integer]
 ) -> NDArray[np.float64]:
-    """Distance of `points` [m], shape (N, 3), to a mesh, shape (N,): every triangle is asked, in float64.
+    """Distance of `points` [m], shape (N, 3), to a mesh, shape (N,), over all triangles, in float64.
 
-    A triangle without area is its edges.
+    A triangle without area counts by its edges.
     """
     corners = torch.as_tensor(np.asarray(vertices, np.float64)[faces])
     best = []
@@ -153,7 +148,7 @@ def _to_segments(points: torch.Tensor, start: torch.Tensor, end: torch.Tensor) -
 
 
 def _to_planes(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
-    """Squared distance of each point (N, 3) to the closest of F triangles (F, 3, 3) that it is straight above."""
+    """Squared distance of each point (N, 3) to the closest of F triangles (F, 3, 3) that it projects into."""
     a, b, c = corners.unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
     area = torch.linalg.vector_norm(normal, dim=-1)

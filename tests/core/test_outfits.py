@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from refu_core.body import Collider, load_body
 from refu_core.errors import RefuError
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
-from refu_core.sdf import ExactSdf
+from refu_core.sdf import ExactSdf, body_frame
 from refu_core.simulation import GarmentDataset, SimulationError, colliders, simulate_dataset
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import names_of
 from refu_core.simulation._store import FORMAT, read_card, write_card
 from refu_core.training._data import TrainingSet
+from refu_core.training._sdf import SdfSampler
 
 NAMES = ("tshirt-male", "short-pant-male")
 JOINED = "short-pant-male+tshirt-male"
@@ -130,6 +132,19 @@ def test_one_garment_of_the_set_is_trained_on(dataset: GarmentDataset) -> None:
         assert (whole - samples.displacement[:1]).norm(dim=-1).mean() < 0.05
     with pytest.raises(RefuError, match=r"wanted a set whose garment is shirt-male, got short-pant-male\+tshirt-male"):
         TrainingSet.of("shirt-male", dataset, None)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_distances_are_learnt_around_the_garment_that_is_asked_for(dataset: GarmentDataset, name: str) -> None:
+    garment, body = load_garment(name), load_body("male")
+    sampler = SdfSampler(dataset, body, garment, torch.arange(1))
+    batch = sampler.draw(torch.Generator().manual_seed(0), bodies=1, points=400, noise=0.0)
+    sample = dataset.sample(0)
+    rotation, root = body_frame(body, torch.tensor(sample.pose[None]), torch.tensor(sample.betas[None]))
+    worn = (torch.tensor(sample.vertices[dataset.parts[name]]) - root) @ rotation[0] + root
+    cloth = trimesh.Trimesh(worn, garment.faces, process=False)
+    on_cloth = batch.points[0, 250:300]  # after those on and near the skin, and near the cloth
+    assert np.abs(trimesh.proximity.closest_point(cloth, on_cloth)[1]).max() < 1e-5
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from test_recordings import POSES, TRANSL, R, T, bvh, same, save
 
 from msg_adapters import MotionFileError, read_motion
 from refu_core import load_body
+from refu_core.recordings._tracks import _who_is_who
 from refu_core.skeleton import JOINT_NAMES
 
 
@@ -54,6 +55,13 @@ def test_frames_become_a_clip(form: str, tmp_path: Path) -> None:
     said = "; ".join(motion.notes)
     assert "frame by frame" in said
     assert ("2 persons" in said) == ("people" in form or "person" in form)
+
+
+def test_people_without_names_are_told_apart_by_where_they_are() -> None:
+    here, there, nowhere = np.zeros(3), np.array([2.0, 0, 0]), np.full(3, np.nan)
+    seen = [[("", nowhere), ("a", here)], [("", here)], [("1", there)], [("", np.array([9.0, 0, 0]))]]
+    assert list(_who_is_who(seen)) == [["0", "a"], ["a"], ["1"], ["3"]]
+    assert list(_who_is_who([[("1", here)], [("", there)]])) == [["1"], ["2"]]
 
 
 @settings(max_examples=40, deadline=None)

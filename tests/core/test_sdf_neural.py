@@ -215,6 +215,9 @@ def test_training_lowers_the_error_and_resumes_to_the_same_weights(
     assert after["absolute_mm"] < 0.8 * before["absolute_mm"]
     assert card["figures"]["test"]["absolute_mm"] < 0.8 * before["absolute_mm"]
 
+    with pytest.raises(RefuError, match="wanted a set whose garment is skirt-female"):
+        train_sdf(dataset, body, load_garment("skirt-female"), tmp_path / "other", settings=settings, quiet=True)
+
     # Interrupted after the first checkpoint, in the middle of a step's writing.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("refu_core.training._sdf.sdf_figures", _FailsAt(3))

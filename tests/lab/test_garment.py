@@ -140,6 +140,7 @@ def test_what_cuts_the_body_and_what_is_torn_is_warned_of(pairs: int, long: floa
         (["--body", "robot"], "no body 'robot'"),
         (["--name", "my kilt"], "no garment is called 'my kilt'"),
         (["--name", "a/b"], "no garment is called 'a/b'"),
+        (["--name", "kilt", "--output", "no/skirt.npz"], "leave --name out, or write kilt.npz"),
         (["--color", "2,0,0"], "color: wanted three numbers"),
         (["--layer", "-1"], "layer: wanted a whole number"),
     ],
