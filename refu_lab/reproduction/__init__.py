@@ -11,6 +11,7 @@ from refu_lab.reproduction._methods import METHODS as METHODS
 from refu_lab.reproduction._methods import SEQUENCE_SHAPES as SEQUENCE_SHAPES
 from refu_lab.reproduction._methods import Method as Method
 from refu_lab.reproduction._motion import OutfitJudge as OutfitJudge
+from refu_lab.reproduction._motion import drawn_shapes as drawn_shapes
 from refu_lab.reproduction._motion import figures_of as figures_of
 from refu_lab.reproduction._motion import frame_pair as frame_pair
 from refu_lab.reproduction._motion import motion_table as motion_table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from msg_adapters import Motion
 from refu_core.errors import RefuError
-from refu_core.frames import LAGS, SmplFrame
+from refu_core.frames import LAGS, N_BETAS, SmplFrame
 from refu_core.history import PoseHistory
 from refu_core.metrics import (
     CollisionChecker,
@@ -37,6 +37,8 @@ MOTION_METHODS = ("node-hybrid", "node-accurate")
 """Methods that are shown for every clip, in the order of the rows."""
 NEAR = 0.02
 """A self-intersection of the collider counts if it is this close to a garment [m]."""
+SPREAD = 2.0
+"""Every other person has betas drawn evenly from within ± this; the rest have those of the recording."""
 _RATE = 60.0
 """Jumps are measured between frames that are about 1/`_RATE` s apart [Hz]."""
 _MOVED = 1e-4
@@ -47,7 +49,8 @@ _STRETCHED = 2.0
 _SKIN = "skin"
 _ABOUT = (
     "Recorded motion has no ground truth: what is measured is how free of the body garments are, how calm, and how "
-    "sound their cloth. Every frame and every vertex counts. The collider is the posed body with its overlaps pulled "
+    "sound their cloth. Every frame and every vertex counts. Every other person has a body shape of their own: "
+    f"ten betas, drawn evenly from within ±{SPREAD:g}. The collider is the posed body with its overlaps pulled "
     "apart, which garments are brought off; the skin runs through itself where limbs meet, so no garment can be free "
     "of it there. *Collider cut* counts frames in which the collider runs through itself within "
     f"{1e3 * NEAR:g} mm of the garment where the rest pose doesn't. *Jumps* are of the vertex that goes farthest in "
@@ -72,8 +75,10 @@ def motion_table(
     labels = {name: METHODS[name].label for name in MOTION_METHODS} | {_SKIN: "skin to collider"}
     table = ResultTable("motion", "Recorded motion", _ABOUT, labels=labels)
     indices = {name: range(0, len(clip) - _step(clip), every) for name, clip in clips.items()}
+    n_pairs = sum(map(len, indices.values()))
+    shapes = drawn_shapes(n_pairs)
     bar = tqdm(
-        total=len(OUTFITS) * sum(map(len, indices.values())),
+        total=len(OUTFITS) * n_pairs,
         desc="motion",
         unit="frame",
         disable=None if progress else True,
@@ -94,10 +99,11 @@ def motion_table(
         worn = OutfitJudge(garments, pipelines)
         of_body = shifts.setdefault(worn.body.name, {})
         is_first = not of_body
+        persons = iter(shapes)
         for name, clip in clips.items():
             shift = SkinShifts()
             for index in indices[name]:
-                judged, way = worn.judge(frame_pair(clip, index))
+                judged, way = worn.judge(frame_pair(clip, index, next(persons)))
                 for (garment, method), one in judged.items():
                     found.setdefault(garment, {}).setdefault((name, method), []).append(one)
                 shift.add(way)
@@ -275,11 +281,18 @@ class OutfitJudge:
         )
 
 
-def frame_pair(clip: Motion, index: int) -> list[SmplFrame]:
-    """A frame of a clip and the one about 1/60 s later, each with its past."""
+def drawn_shapes(n: int) -> list[NDArray[np.float32] | None]:
+    """Betas of the persons in n frame pairs, shape (10,) each, by `SPREAD`; None for the recording's."""
+    drawn = np.random.default_rng(0).uniform(-SPREAD, SPREAD, (n, N_BETAS)).astype(np.float32)
+    return [None if i % 2 == 0 else betas for i, betas in enumerate(drawn)]
+
+
+def frame_pair(clip: Motion, index: int, betas: NDArray[np.float32] | None = None) -> list[SmplFrame]:
+    """A frame of a clip and the one 1/60 s later, with the poses before them; with other `betas` if given."""
     first = max(0, index - math.ceil(LAGS[-1] * clip.fps) - 1)
     frames = PoseHistory.told(map(clip.frame, range(first, index + _step(clip) + 1)))
-    return [frames[index - first], frames[-1]]
+    pair = [frames[index - first], frames[-1]]
+    return pair if betas is None else [replace(frame, betas=betas) for frame in pair]
 
 
 def _step(clip: Motion) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -415,14 +416,15 @@ def test_motion_table_against_a_loop(walk: Motion, motion_table: rp.ResultTable,
     body = pipeline.body.faces.numpy()
     ways = []
     found: dict[str, dict[str, list[float]]] = {name: {} for name in garments}
-    for index in (0, 4):
-        told = PoseHistory.told(walk.frame(i) for i in range(index + 2))[-2:]
+    for index, betas in zip((0, 4), rp.drawn_shapes(3), strict=False):
+        shape = np.zeros(10, np.float32) if betas is None else betas
+        told = [replace(f, betas=shape) for f in PoseHistory.told(walk.frame(i) for i in range(index + 2))[-2:]]
         now, then, start, end = (p(frame) for p in (pipeline, skinned) for frame in told)
         ways += np.linalg.norm(now.body - now.skin, axis=1).tolist()
         for name, garment in pipeline.garments.items():
             faces, edges = garment.faces.numpy(), garment.edges.numpy()
             winding = igl.fast_winding_number(now.body.astype(float), body, now[name].local.astype(float))
-            rest = garment.rest(torch.zeros(1, 10))[0].numpy()
+            rest = garment.rest(torch.tensor(shape[None]))[0].numpy()
             length, wanted = (np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1) for v in (now[name].local, rest))
             ahead = (then[name].local - now[name].local) - (end[name].local - start[name].local)
             worn = [one for one in garments if one != name]
@@ -453,6 +455,16 @@ def test_motion_table_against_a_loop(walk: Motion, motion_table: rp.ResultTable,
         "shift_moved_percent": pytest.approx(100 * np.mean(np.array(ways) > 1e-4), abs=0.01),
     }
     assert max(ways) > 0.002  # the arms do press
+
+
+def test_every_other_person_has_a_shape_of_their_own() -> None:
+    shapes = rp.drawn_shapes(2000)
+    assert all(betas is None for betas in shapes[::2])
+    drawn = np.stack([betas for betas in shapes[1::2] if betas is not None])
+    assert len(np.unique(drawn, axis=0)) == 1000
+    assert -2 <= drawn.min() < -1.9
+    assert 1.9 < drawn.max() <= 2
+    assert np.abs(drawn.mean(0)).max() < 0.15
 
 
 def test_motion_of_one_frame_has_no_pair(walk: Motion, library: rp.Library) -> None:
