@@ -12,8 +12,8 @@ import sys
 from refu_core.errors import RefuError
 try:
     import warp as wp
-    import refu_core.body._pose_kernels
-    wp.load_module("refu_core.body._pose_kernels", device="cpu")
+    import refu_core.sdf._crossing_kernels
+    wp.load_module("refu_core.sdf._crossing_kernels", device="cpu")
 except RefuError as error:
     sys.exit(f"RefuError: {error}")
 """
@@ -24,9 +24,9 @@ from pathlib import Path
 from refu_core import _kernel_cache
 
 def load_again():
-    wp.get_module("refu_core.body._pose_kernels").unload()
+    wp.get_module("refu_core.sdf._crossing_kernels").unload()
     _kernel_cache._loaded.clear()
-    wp.load_module("refu_core.body._pose_kernels", device="cpu")
+    wp.load_module("refu_core.sdf._crossing_kernels", device="cpu")
 
 def flipped(data):
     data = bytearray(data)
@@ -35,7 +35,7 @@ def flipped(data):
     return bytes(data)
 
 input()  # until the other process is done
-(folder,) = Path(wp.config.kernel_cache_dir).glob("wp_refu_core.body._pose_kernels_*")
+(folder,) = Path(wp.config.kernel_cache_dir).glob("wp_refu_core.sdf._crossing_kernels_*")
 (built,), (meta,), sums = folder.glob("*.o"), folder.glob("*.meta"), folder / "refu-checksums.json"
 rng, n_tried = random.Random(1), 0
 for path in (built, meta, sums):
