@@ -74,7 +74,7 @@ def collect() -> dict[str, Any]:
         "refu": __version__,
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
-        **{name: installed(name) for name in ("torch", "warp-lang", "numpy", "mcap")},
+        **{name: installed(name) for name in ("torch", "warp-lang", "numpy")},
         "rclpy": "importable" if find_spec("rclpy") else "not found (needed by the node only)",
         "devices": ["cpu", *(f"cuda: {name}" for name in cuda)],
         "bodies": {body.name: f"{body.n_vertices} vertices, {body.fingerprint}" for body in bodies},

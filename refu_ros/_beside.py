@@ -24,7 +24,7 @@ from refu_core.options import PipelineOptions
 from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
-    from refu_core import GarmentPipeline
+    from refu_core.outputs import Fittings
     from refu_core.realtime import PipelineOutput
 
 Then = Callable[["PipelineOutput", dict[str, NDArray[np.float64]]], object]
@@ -40,22 +40,19 @@ NICE = 10
 """Niceness of work on request: garments that are due 30 times a second come first."""
 
 
-def load(options: PipelineOptions, *, threads: int = 1) -> GarmentPipeline:
+def load(options: PipelineOptions, *, threads: int = 1) -> Fittings:
     """Loads a pipeline, which takes some tenths of a second, and computes once all that a subscriber may want.
 
     Kernels are loaded when they first run; on the stream, frames that came meanwhile would be lost. Raises `RefuError`.
     """
     from refu_core.outputs import DressedPerson, Fittings  # loads torch
 
-    pipeline = options.load(threads=threads)
-    frame, fittings = (
-        SmplFrame(np.zeros((N_JOINTS, 3), np.float32)),
-        Fittings(pipeline, weights=options.weights or None),
-    )
-    worn = DressedPerson("", frame, pipeline(frame), fittings, np.eye(3), np.zeros(3))
+    fittings = Fittings(options.load(threads=threads), weights=options.weights or None).prepare()
+    frame = SmplFrame(np.zeros((N_JOINTS, 3), np.float32))
+    worn = DressedPerson("", frame, fittings.pipeline(frame), fittings, np.eye(3), np.zeros(3))
     for ask in (worn.normals, worn.clearance, worn.sigma, worn.contacts):
         ask()
-    return pipeline
+    return fittings
 
 
 class PipelineLoader:
@@ -63,7 +60,7 @@ class PipelineLoader:
 
     def __init__(
         self,
-        use: Callable[[GarmentPipeline, PipelineOptions], None],
+        use: Callable[[Fittings, PipelineOptions], None],
         fail: Callable[[Exception, PipelineOptions], None],
         *,
         threads: int,
@@ -86,12 +83,11 @@ class PipelineLoader:
         if options is not self._wanted:
             return
         try:
-            pipeline = load(options, threads=self._threads)
+            fittings = load(options, threads=self._threads)
+            if options is self._wanted:
+                self._use(fittings, options)
         except Exception as error:  # missing weights, no CUDA: the running pipeline stays
             self._fail(error, options)
-            return
-        if options is self._wanted:
-            self._use(pipeline, options)
 
 
 class RequestDresser:
@@ -124,11 +120,10 @@ class RequestDresser:
         self._load.cache_clear()
 
     def _dress(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> object:
-        pipeline = self._load(settings.pipeline)
-        pipeline.margin = settings.margin
+        pipeline = self._load(settings.pipeline).pipeline
         up = up_of_sender(settings.axes, settings.frame_id, np.eye(3))
         frame = replace(settings.applied(frame), up=up)
-        output = pipeline(frame)
+        output = pipeline(frame, margin=settings.margin)
         rotation = ros_from_sender(settings.axes)
         placed = {name: (mesh.local + frame.transl) @ rotation.T for name, mesh in output.items()}
         if not all(np.isfinite(points).all() for points in placed.values()):

@@ -29,7 +29,7 @@ from refu_ros._requests import Requests
 from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
-    from refu_core import GarmentPipeline
+    from refu_core.outputs import Fittings
     from refu_ros._worker import Worker
 
 NODE_NAME = "garment_node"
@@ -57,7 +57,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._state = "unconfigured"
         self._worker: Worker | None = None
         self._loader: PipelineLoader | None = None
-        self._pipeline: GarmentPipeline | None = None
+        self._fittings: Fittings | None = None
         self._in_use: PipelineOptions | None = None
         self._refused: PipelineOptions | None = None
         self._lost = ""
@@ -96,7 +96,11 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         except RefuError as error:
             self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
-        self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded, threads=self.settings.threads)
+        self._loader = PipelineLoader(
+            lambda *new: self.executor.create_task(self._on_loaded, *new),  # the executor's thread takes it over
+            self._on_not_loaded,
+            threads=self.settings.threads,
+        )
         self._state = "inactive"
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
@@ -104,14 +108,14 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     @transition
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Dresses everybody who sends, as soon as somebody wants that."""
-        assert self._pipeline is not None
+        assert self._fittings is not None
         if self.settings.record:
             self.recording.try_start(self.settings.record)  # if it can't, people are dressed all the same
         result = super().on_activate(state)
         scene = self._listener.scene = Scene(self.statistics, most=self._listener.room)
         from refu_ros._worker import Worker  # loads torch
 
-        self._worker = Worker(scene, self.statistics, self, settings=self.settings, pipeline=self._pipeline)
+        self._worker = Worker(scene, self.statistics, self, settings=self.settings, fittings=self._fittings)
         self._worker.start()
         self._has_sent = False
         self._state = "active"
@@ -169,7 +173,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _cleanup(self) -> None:
         if self._loader is not None:
             self._loader.close()
-        self._loader = self._pipeline = self._in_use = None
+        self._loader = self._fittings = self._in_use = None
         self._state = "unconfigured"
 
     def _attend(self) -> None:
@@ -247,24 +251,24 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             self._lost = ""  # the operator knows better
         self.settings = settings
         self._attend()  # a recording may have begun
-        if self._pipeline is not None:
-            self._listener.follow(self._pipeline.body)
+        if self._fittings is not None:
+            self._listener.follow(self._fittings.pipeline.body)
         if self._worker is not None:
             self._worker.settings = settings
         if reload and self._loader is not None:
             self._loader.request(self._pipeline_key)
         return SetParametersResult(successful=True)
 
-    def _take(self, pipeline: GarmentPipeline, key: PipelineOptions) -> None:
-        self._pipeline, self._in_use = pipeline, key
-        self._listener.follow(pipeline.body)
-        for text in pipeline.warnings:
+    def _take(self, fittings: Fittings, key: PipelineOptions) -> None:
+        self._fittings, self._in_use = fittings, key
+        self._listener.follow(fittings.pipeline.body)
+        for text in fittings.pipeline.warnings:
             self.get_logger().warning(text)
 
-    def _on_loaded(self, pipeline: GarmentPipeline, key: PipelineOptions) -> None:
-        self._take(pipeline, key)
+    def _on_loaded(self, fittings: Fittings, key: PipelineOptions) -> None:
+        self._take(fittings, key)
         if self._worker is not None:
-            self._worker.use(pipeline)
+            self._worker.fittings = fittings
         self.statistics.set_error(f"{self._lost}: on the cpu now; set device to try it again" if self._lost else "")
         self.get_logger().info(f"now with {key}")
 
@@ -301,7 +305,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._attend()
         if self._worker is not None:
             self._hold_topics()
-            for name, reason in self._worker.fittings.without_planner.items():
+            for name, reason in [*self._worker.fittings.without_planner.items()]:  # a thread adds to them
                 text = f"planners aren't sent {name}: {printable(reason)}"
                 self.get_logger().warning(text, throttle_duration_sec=60.0)
         report = self.statistics.report()

@@ -6,6 +6,7 @@ Requests aren't trusted.
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from functools import partial
@@ -123,11 +124,10 @@ class Requests:
                 done = (await future).result()
             finally:
                 self._job = self._goal = None
+            _fill(result, done, job.output)
         except Exception as error:
             self._node.fault("replay_bag", error)
             result.message = printable(error)
-        else:
-            _fill(result, done, job.output)
         if goal.is_cancel_requested:
             goal.canceled()
         elif result.success:
@@ -166,8 +166,8 @@ def _fill(result: Any, done: dict[str, Any], output: object) -> None:
     result.output, result.frames = str(output), done["frames"]
     for name, figures in done["garments"].items():
         result.garments.append(name)
-        result.vfcp_percent.append(float(figures["vfcp_percent"]))
-        result.cfmp_percent.append(float(figures["cfmp_percent"]))
+        for shares, name in ((result.vfcp_percent, "vfcp_percent"), (result.cfmp_percent, "cfmp_percent")):
+            shares.append(math.nan if figures[name] is None else figures[name])  # cancelled before its first frame
     result.success = not done["interrupted"]
     said = ["cancelled: the bag has the frames that were done"] if done["interrupted"] else done["warnings"]
     result.message = printable("; ".join(said))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -17,6 +17,15 @@ _PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 _FRAME = re.compile(r"[^/\s\x00-\x1f\x7f][^\s\x00-\x1f\x7f]{0,254}")
 _SLOWEST_HZ = 0.01
 AXES = ("smpl", "frame")
+
+
+def require_persons(persons: Sequence[str]) -> list[str]:
+    """Those of the persons that have a name. Raises `SettingsError` unless names are distinct and good for topics."""
+    named = [*filter(None, persons)]
+    if not all(map(_PERSON.fullmatch, named)) or len(set(persons)) < len(persons):
+        msg = f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}"
+        raise SettingsError(msg)
+    return named
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,10 +96,7 @@ class NodeSettings(DressOptions):
 
     def __post_init__(self) -> None:
         check(self)
-        named = [*filter(None, self.persons)]
-        if not all(map(_PERSON.fullmatch, named)) or len(set(self.persons)) < len(self.persons):
-            msg = f"persons: wanted distinct names of letters, digits and underscores, got {list(self.persons)}"
-            raise SettingsError(msg)
+        named = require_persons(self.persons)
         if not self.persons or (len(named) < len(self.persons) > 1):
             msg = f"persons: wanted one person without a name, or names for all, got {list(self.persons)}"
             raise SettingsError(msg)

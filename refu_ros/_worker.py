@@ -17,7 +17,7 @@ from msg_adapters.axes import ros_from_sender
 from msg_adapters.outputs import Moment, make_outputs
 from msg_adapters.scene import Arrival, Scene
 from msg_adapters.statistics import Statistics
-from refu_core import GarmentPipeline, RefuError, SmplFrame
+from refu_core import RefuError, SmplFrame
 from refu_core._device import is_device_loss
 from refu_core.history import PoseHistory
 from refu_core.outputs import DressedPerson, Fittings
@@ -47,7 +47,6 @@ class _Batch:
 
     turn: int
     settings: NodeSettings
-    pipeline: GarmentPipeline
     fittings: Fittings
     arrivals: Mapping[str, Arrival]
     frames: Mapping[str, SmplFrame]
@@ -60,7 +59,7 @@ class _Batch:
         style = b"" if frame.style is None else frame.style.tobytes()
         past = b"" if frame.past is None else frame.past.tobytes()
         up = frame.up.tobytes()
-        return self.pipeline, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style, up, past
+        return self.fittings, self.settings.margin, frame.pose.tobytes() + frame.betas.tobytes() + style, up, past
 
 
 def _there(arrival: Arrival, settings: NodeSettings) -> Placement:
@@ -83,17 +82,17 @@ class Worker:
         outlet: GarmentNode,
         *,
         settings: NodeSettings,
-        pipeline: GarmentPipeline,
+        fittings: Fittings,
     ) -> None:
         self.settings = settings
         self._scene = scene
         self._statistics = statistics
         self._outlet = outlet
-        self._next = self._fitted(pipeline)
+        self.fittings = self._planned_with = self._sent_with = fittings
+        """The pipeline, and what is known of its garments; others may be put here at any time, for the next tick."""
         self._dressed: dict[str, _Known] = {}
         self._history = PoseHistory()
         self._outputs = make_outputs(tf=settings.publish_tf)  # they remember what was worn
-        self._pipeline, self._sent_with = self._next
         self._here: set[str] = set()
         self._is_lost = False
         self._stopping = threading.Event()
@@ -119,18 +118,6 @@ class Worker:
                 thread.join()
         self._remove([*self._here])
 
-    def use(self, pipeline: GarmentPipeline) -> None:
-        """Uses another pipeline from the next tick on."""
-        self._next = self._fitted(pipeline)
-
-    @property
-    def fittings(self) -> Fittings:
-        """What is known of the garments that the next tick will dress people in."""
-        return self._next[1]
-
-    def _fitted(self, pipeline: GarmentPipeline) -> tuple[GarmentPipeline, Fittings]:
-        return pipeline, Fittings(pipeline, weights=self.settings.weights or None).prepare()
-
     def _run(self) -> None:
         torch.set_num_threads(1)  # the robot's other nodes want their cores, too
         while not self._stopping.is_set():
@@ -145,7 +132,7 @@ class Worker:
     def _take(self) -> Mapping[str, Arrival]:
         """The newest frames, as soon as there are some, a thread of the pipeline is free, and the rate allows it."""
         with self._in_order:
-            self._in_order.wait_for(lambda: self._n_taken - self._n_done < self._next[0].threads)
+            self._in_order.wait_for(lambda: self._n_taken - self._n_done < self.fittings.pipeline.threads)
         period = 1.0 / self.settings.max_rate if self.settings.max_rate else 0.0
         idle = _IDLE_S if self._here or self._scene.persons else _EMPTY_S
         arrivals = self._scene.take(not_before=self._last + period, timeout=idle)
@@ -160,9 +147,8 @@ class Worker:
             batch = self._plan(take())
         outputs: dict[str, PipelineOutput] = {}
         try:
-            outputs = self._infer(
-                batch.pipeline, {person: frame for person, frame in batch.frames.items() if person not in batch.known}
-            )
+            new = {person: frame for person, frame in batch.frames.items() if person not in batch.known}
+            outputs = self._infer(batch, new)
         finally:  # the others would wait forever for a turn that is left out
             with self._in_order:
                 self._in_order.wait_for(lambda: self._n_done == batch.turn)
@@ -175,11 +161,9 @@ class Worker:
     def _plan(self, arrivals: Mapping[str, Arrival]) -> _Batch:
         """What there is to do for these people, and with what."""
         settings = self.settings
-        pipeline, fittings = self._next
-        if pipeline is not self._pipeline:
-            self._pipeline, self._is_lost = pipeline, False
-        if settings.margin != pipeline.margin:
-            pipeline.margin = settings.margin
+        fittings = self.fittings
+        if fittings is not self._planned_with:
+            self._planned_with, self._is_lost = fittings, False
         gone = self._scene.leave(settings.person_timeout)
         near = self._near(arrivals, settings)
         gone += [person for person in arrivals if person not in near]
@@ -190,12 +174,12 @@ class Worker:
                 self._statistics.count("skip.unwatched")
             near = {}
         frames = {person: settings.applied(arrival.frame) for person, arrival in near.items()}
-        if pipeline.heeds_past:
+        if fittings.pipeline.heeds_past:
             frames = {
                 person: self._told(frame, person, _there(near[person], settings)) for person, frame in frames.items()
             }
         known: dict[str, _Known] = {}
-        batch = _Batch(self._n_taken, settings, pipeline, fittings, near, frames, known, gone)
+        batch = _Batch(self._n_taken, settings, fittings, near, frames, known, gone)
         for person, frame in frames.items():
             last = self._dressed.get(person)
             if last is not None and last.inputs == batch.inputs(frame):
@@ -206,7 +190,7 @@ class Worker:
 
     def _told(self, frame: SmplFrame, person: str, there: Placement) -> SmplFrame:
         """A frame with its past in the messages' frame, where what moves only for a moving camera stands still."""
-        body = self._pipeline.body
+        body = self._planned_with.pipeline.body
         pelvis = body.rest_joints(torch.tensor(frame.betas[None], device=body.device))[0, 0].cpu().double().numpy()
         pose = frame.pose.copy()
         pose[0] = Rotation.from_matrix(there.rotation @ Rotation.from_rotvec(pose[0]).as_matrix()).as_rotvec()
@@ -255,15 +239,16 @@ class Worker:
                     self._statistics.count("beyond_promise")
         return found, unresolved
 
-    def _infer(self, pipeline: GarmentPipeline, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:
+    def _infer(self, batch: _Batch, frames: Mapping[str, SmplFrame]) -> dict[str, PipelineOutput]:
         """All persons in one batch; where that fails, one by one, so that one failure affects nobody else."""
         try:
-            return dict(zip(frames, pipeline([*frames.values()]), strict=True)) if frames else {}
+            outputs = batch.fittings.pipeline([*frames.values()], margin=batch.settings.margin) if frames else []
+            return dict(zip(frames, outputs, strict=True))
         except Exception as error:
             if len(frames) == 1:
                 self._fail(error, f"{next(iter(frames)) or 'the person'}: ")
                 return {}
-        alone = [self._infer(pipeline, {person: frame}) for person, frame in frames.items()]
+        alone = [self._infer(batch, {person: frame}) for person, frame in frames.items()]
         return {person: output for found in alone for person, output in found.items()}
 
     def _fail(self, error: Exception, who: str) -> None:

@@ -16,13 +16,13 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import INPUT_TYPES, WORLD_FRAME, Encoder, encoder_for, load_motion
 from refu_core import FrameError, SmplFrame
-from refu_core.options import SettingsError, check, fixed
+from refu_core.options import check, fixed
 from refu_core.recordings import Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
 from refu_ros._parameters import declare, listing
 from refu_ros._program import hear, run, spin
-from refu_ros._settings import AXES
+from refu_ros._settings import AXES, require_persons
 
 TOPIC = "smpl_params"
 
@@ -48,10 +48,7 @@ class PublisherOptions:
 
     def __post_init__(self) -> None:
         check(self)
-        is_named = all(name.isidentifier() for name in self.persons if name)
-        if not is_named or len(set(self.persons)) < len(self.persons):
-            msg = f"persons: wanted distinct names of letters, digits and underscores, got {list(self.persons)}"
-            raise SettingsError(msg)
+        require_persons(self.persons)
 
 
 class SmplPublisher(GuardedNode):

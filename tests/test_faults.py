@@ -33,6 +33,7 @@ from msg_adapters.statistics import Statistics
 from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_body
 from refu_core._device import is_device_loss
 from refu_core.backbones import TailorNetConfig
+from refu_core.outputs import Fittings
 from refu_core.training import load_checkpoint, save_checkpoint
 from refu_core.weights import save_weights
 from refu_lab.cli import main
@@ -244,16 +245,16 @@ class Failing:
 
     def __init__(self, pipeline: GarmentPipeline) -> None:
         self._pipeline = pipeline
-        self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
+        self.body, self.garments = pipeline.body, pipeline.garments
         self.untrained = pipeline.untrained
         self.threads, self.frames = 1, 0
         self.heeds_past = pipeline.heeds_past
 
-    def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+    def __call__(self, frames: list[SmplFrame], *, margin: float | None) -> list[Any]:
         self.frames += 1
         if self.frames > 2:
             raise RuntimeError(LOST)
-        return self._pipeline(frames)
+        return self._pipeline(frames, margin=margin)
 
 
 class Outlet:
@@ -296,7 +297,7 @@ def test_a_lost_device_is_reported_once_and_another_pipeline_takes_over() -> Non
     statistics, outlet = Statistics(), Outlet(pipeline)
     scene = Scene(statistics)
     settings = NodeSettings(garments=(GARMENT,), backbone="skinned", sdf="none")
-    worker = Worker(scene, statistics, outlet, settings=settings, pipeline=Failing(pipeline))  # type: ignore[arg-type]
+    worker = Worker(scene, statistics, outlet, settings=settings, fittings=Fittings(Failing(pipeline)))  # type: ignore[arg-type]
 
     def tick(i: int) -> None:
         scene.put("", turned(i))
@@ -311,7 +312,7 @@ def test_a_lost_device_is_reported_once_and_another_pipeline_takes_over() -> Non
     parts |= {"recording": None, "recording_error": ""}
     output = status_of("garments", statuses(report, settings, Situation(**parts)))
     assert (output.level, "the device has failed" in output.message) == (2, True)
-    worker.use(pipeline)
+    worker.fittings = Fittings(pipeline)
     tick(6)
     assert outlet.sent == 3
     in_use = replace(settings.pipeline, device="cpu")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import resource
 import tempfile
 import threading
@@ -46,6 +47,7 @@ from refu_core.keypoints import Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE
 from refu_core.options import SettingsError, specs_of
+from refu_core.outputs import Fittings
 from refu_ros._beside import PipelineLoader, RequestDresser, asked_path, load
 from refu_ros._diagnostics import Situation, statuses
 from refu_ros._settings import NodeSettings
@@ -364,7 +366,11 @@ class Setup:
         self.viewer = Viewer()
         settings = {"garments": [GARMENT], **settings}
         self.worker = Worker(
-            self.scene, self.statistics, self.viewer, settings=NodeSettings().changed(settings), pipeline=pipeline
+            self.scene,
+            self.statistics,
+            self.viewer,
+            settings=NodeSettings().changed(settings),
+            fittings=Fittings(pipeline),
         )
 
     def tick(self, **frames: SmplFrame) -> None:
@@ -408,7 +414,7 @@ def test_a_camera_that_turns_swings_no_skirt() -> None:
         seen = camera.inverse()
         pose = stands.copy()
         pose[0] = Rotation.from_matrix(seen.rotation @ Rotation.from_rotvec(stands[0]).as_matrix()).as_rotvec()
-        pelvis = setup.worker._pipeline.body.rest_joints(torch.zeros(1, 10))[0, 0].double().numpy()
+        pelvis = setup.worker.fittings.pipeline.body.rest_joints(torch.zeros(1, 10))[0, 0].double().numpy()
         transl = seen.rotation @ (pelvis + 3 * np.eye(3)[2]) + seen.translation - pelvis
         there = SmplFrame(pose=pose, transl=transl, stamp_ns=1 + step * 33_000_000, up=seen.rotation[:, 1])
         setup.scene.put("ann", there, camera)
@@ -470,7 +476,7 @@ def test_who_is_near_is_so_in_the_frame_of_the_messages(pipeline: GarmentPipelin
 def test_a_pipeline_is_swapped_between_ticks(pipeline: GarmentPipeline) -> None:
     setup = Setup(pipeline)
     setup.tick(ann=frame(stamp_ns=1))
-    setup.worker.use(GarmentPipeline.load(["tshirt-male"]))
+    setup.worker.fittings = Fittings(GarmentPipeline.load(["tshirt-male"]))
     setup.tick(ann=frame(stamp_ns=2))
     added, deleted = setup.viewer.messages[1:]
     assert [(m.ns, m.action) for m in added] == [("ann/tshirt-male", 0)]
@@ -500,16 +506,16 @@ class Choosy:
 
     def __init__(self, pipeline: GarmentPipeline) -> None:
         self._pipeline = pipeline
-        self.body, self.garments, self.margin = pipeline.body, pipeline.garments, pipeline.margin
+        self.body, self.garments = pipeline.body, pipeline.garments
         self.untrained = pipeline.untrained
         self.threads = pipeline.threads
         self.heeds_past = pipeline.heeds_past
 
-    def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+    def __call__(self, frames: list[SmplFrame], *, margin: float | None) -> list[Any]:
         if any(frame.pose[1, 0] > 1 for frame in frames):
             msg = "not this pose"
             raise ValueError(msg)
-        return self._pipeline(frames)
+        return self._pipeline(frames, margin=margin)
 
 
 def test_one_persons_failure_is_nobody_elses(pipeline: GarmentPipeline) -> None:
@@ -529,15 +535,15 @@ def test_the_rate_limit(pipeline: GarmentPipeline, monkeypatch: pytest.MonkeyPat
     began: list[tuple[float, int]] = []
 
     class Slow(Choosy):
-        def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+        def __call__(self, frames: list[SmplFrame], *, margin: float | None) -> list[Any]:
             began.append((time.now, frames[0].stamp_ns))
             time.sleep(0.002)
-            return super().__call__(frames)
+            return super().__call__(frames, margin=margin)
 
     statistics, viewer = Statistics(), Viewer()
     scene = Scene(statistics, clock=time.monotonic)
     settings = NodeSettings().changed({"garments": [GARMENT], "max_rate": 20})
-    worker = Worker(scene, statistics, viewer, settings=settings, pipeline=Slow(pipeline))  # type: ignore[arg-type]
+    worker = Worker(scene, statistics, viewer, settings=settings, fittings=Fittings(Slow(pipeline)))  # type: ignore[arg-type]
     for i in range(100):
         time.at(0.0049 * i, lambda i=i: scene.put("", frame(0.001 * i, stamp_ns=i)))
     time.at(0.49, worker._stopping.set)
@@ -560,14 +566,14 @@ class Uneven(Choosy):
         self.began: list[int] = []
         self.first_began, self.second_ended = threading.Event(), threading.Event()
 
-    def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+    def __call__(self, frames: list[SmplFrame], *, margin: float | None) -> list[Any]:
         self.began.append(frames[0].stamp_ns)
         if frames[0].stamp_ns == 1:
             self.first_began.set()
             assert self.second_ended.wait(60)
             if self.fails:
                 raise MemoryError
-        outputs = super().__call__(frames)
+        outputs = super().__call__(frames, margin=margin)
         if frames[0].stamp_ns == 2:
             self.second_ended.set()
         return outputs
@@ -578,7 +584,7 @@ def test_threads_send_in_the_order_in_which_frames_came(pipeline: GarmentPipelin
     uneven, statistics, viewer = Uneven(pipeline, fails=fails), Statistics(), Viewer()
     scene = Scene(statistics)
     settings = NodeSettings(garments=(GARMENT,), threads=3)
-    worker = Worker(scene, statistics, viewer, settings=settings, pipeline=uneven)  # type: ignore[arg-type]
+    worker = Worker(scene, statistics, viewer, settings=settings, fittings=Fittings(uneven))  # type: ignore[arg-type]
     worker.start()
     scene.put("", frame(0.1, stamp_ns=1))
     assert uneven.first_began.wait(60)
@@ -596,15 +602,15 @@ def test_no_more_is_taken_than_the_pipeline_has_threads(pipeline: GarmentPipelin
     began, may_end = threading.Event(), threading.Event()
 
     class Waiting(Choosy):
-        def __call__(self, frames: list[SmplFrame]) -> list[Any]:
+        def __call__(self, frames: list[SmplFrame], *, margin: float | None) -> list[Any]:
             began.set()
             assert may_end.wait(60)
-            return super().__call__(frames)
+            return super().__call__(frames, margin=margin)
 
     statistics, viewer = Statistics(), Viewer()
     scene = Scene(statistics)
     settings = NodeSettings(garments=(GARMENT,), threads=3)
-    worker = Worker(scene, statistics, viewer, settings=settings, pipeline=Waiting(pipeline))  # type: ignore[arg-type]
+    worker = Worker(scene, statistics, viewer, settings=settings, fittings=Fittings(Waiting(pipeline)))  # type: ignore[arg-type]
     worker.start()
     scene.put("", frame(0.1, stamp_ns=1))
     assert began.wait(60)
@@ -636,6 +642,18 @@ def test_what_cannot_be_loaded_is_reported() -> None:
     loader.close()
     assert "nonsense" in str(came[0])
     assert came[1] == good
+
+
+def test_what_cannot_be_taken_over_is_reported() -> None:
+    def use(_fittings: object, _key: object) -> None:
+        msg = "no room for it"
+        raise RuntimeError(msg)
+
+    said = queue.SimpleQueue[Exception]()
+    loader = PipelineLoader(use, lambda error, _: said.put(error), threads=1)
+    loader.request(NodeSettings(garments=(GARMENT,), backbone="skinned", sdf="none").pipeline)
+    assert "no room for it" in str(said.get(timeout=120))
+    loader.close()
 
 
 # Diagnostics --------------------------------------------------------------------------------------
@@ -781,7 +799,7 @@ def test_who_wears_the_garments_is_a_parameter_that_needs_another_pipeline(how: 
         NodeSettings().changed(two)
     asked = NodeSettings().changed({**two, how: "neutral"})
     assert " on neutral " in str(asked.pipeline)
-    assert load(asked.pipeline).body.name == "neutral"
+    assert load(asked.pipeline).pipeline.body.name == "neutral"
     assert asked.betas_are_told
     missing = asked.changed({"body": "", "betas_from": "", "garments": ["short-pant-male"], how: "/none/SMPL.pkl"})
     with pytest.raises(BodyError, match=r"/none/SMPL\.pkl: can't be read"):
@@ -864,7 +882,7 @@ def test_the_collider_is_a_parameter_that_needs_another_pipeline(collider: bool)
     assert plain.collider
     assert (asked.pipeline == plain.pipeline) is collider
     assert ("no collider" in str(asked.pipeline)) is not collider
-    assert (load(asked.pipeline).outfit.collider is not None) is collider
+    assert (load(asked.pipeline).pipeline.outfit.collider is not None) is collider
     with pytest.raises(SettingsError, match="true or false"):
         plain.changed({"collider": "yes"})
 

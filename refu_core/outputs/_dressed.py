@@ -31,7 +31,7 @@ class Fittings:
 
     def __init__(self, pipeline: GarmentPipeline, *, weights: str | os.PathLike[str] | None = None) -> None:
         """For a pipeline, and the folder of weights that it was loaded with, if any."""
-        self._pipeline, self._weights = pipeline, weights
+        self.pipeline, self._weights = pipeline, weights
         self.garments = pipeline.garments
         self.names = tuple(self.garments)
         self.faces = {name: garment.faces.cpu().numpy() for name, garment in self.garments.items()}
@@ -64,7 +64,7 @@ class Fittings:
     def planner(self, name: str) -> PlannerMesh:
         """A garment's mesh for planners; takes ten seconds or so when it is made for the first time ever."""
         if name not in self._planners:
-            self._planners[name] = PlannerMesh.of(self._pipeline, name)
+            self._planners[name] = PlannerMesh.of(self.pipeline, name)
         return self._planners[name]
 
     def has_planner(self, name: str) -> bool:
@@ -83,17 +83,17 @@ class Fittings:
     @cached_property
     def clearance(self) -> Clearance:
         """What computes the clearance of all garments."""
-        return Clearance.of(self._pipeline)
+        return Clearance.of(self.pipeline)
 
     @cached_property
     def contacts(self) -> LimbContacts:
         """What finds contacts of the body's parts through all garments."""
-        return LimbContacts.of(self._pipeline)
+        return LimbContacts.of(self.pipeline)
 
     @cached_property
     def sigma(self) -> Sigma:
         """What computes σ of all garments."""
-        return Sigma(self._pipeline, folder=self._weights)
+        return Sigma(self.pipeline, folder=self._weights)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cached_property, partial
 from queue import Empty, LifoQueue
 
@@ -53,8 +53,9 @@ class Crew:
             while len(steps) < len(frames) and os.getpid() == self._process:
                 steps.append(self._free.get_nowait())
         own, *others = (frames[part] for part in shares(len(frames), len(steps)))
-        started = [self._pool.submit(work, *pair) for pair in zip(steps[1:], others, strict=True)]
+        started: list[Future[list[PipelineOutput]]] = []
         try:
+            started += (self._pool.submit(work, *pair) for pair in zip(steps[1:], others, strict=True))
             done = work(step, own)
         finally:
             wait(started)  # before that nobody else may take a step

@@ -48,9 +48,9 @@ _MOST_WEARERS = 64
 class GarmentPipeline:
     """Predicts garments on SMPL bodies, frame by frame, and brings them off the body (paper, Sec. 3).
 
-    Any thread may call a pipeline, set its `margin`, and read what it has returned. As many calls run at the same time
-    as the pipeline has `threads`, and others wait; a batch is shared out among the free ones. Load a pipeline in each
-    process, after the fork: it can't be pickled.
+    Any thread may call a pipeline, and read what it has returned. As many calls run at the same time as the pipeline
+    has `threads`, and others wait; a batch is shared out among the free ones. Load a pipeline in each process, after
+    the fork: it can't be pickled.
 
     Example:
         >>> pipeline = GarmentPipeline.load(["tshirt-male"])
@@ -82,7 +82,8 @@ class GarmentPipeline:
         """Whether frames should have their past (`PoseHistory`), as the backbone `dynamic` needs it."""
         self.threads = len(steps)
         """How many calls may run at the same time; on a GPU, how many parts of a batch."""
-        self._margin = margin
+        self.margin = margin
+        """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
         self._style = style
         on_gpu = outfit.body.device.type == "cuda"
         self._graphs = StepGraphs(partial(packed_by, steps), outfit.body.device) if graph and on_gpu else None
@@ -103,16 +104,6 @@ class GarmentPipeline:
     def warnings(self) -> list[str]:
         """Warnings known before anything is dressed, for people to read."""
         return [] if self.fit is None else self.fit.warnings
-
-    @property
-    def margin(self) -> float | None:
-        """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
-        return self._margin
-
-    @margin.setter
-    def margin(self, margin: float | None) -> None:
-        _check_margin(margin)
-        self._margin = margin
 
     def __repr__(self) -> str:
         return f"GarmentPipeline({', '.join(self.garments)} on {self.body.name}, {self.body.device})"
@@ -205,27 +196,33 @@ class GarmentPipeline:
         return cls(steps, margin=margin, style=gamma, graph=graph)
 
     @overload
-    def __call__(self, frames: SmplFrame) -> PipelineOutput: ...
+    def __call__(self, frames: SmplFrame, *, margin: float | None = None) -> PipelineOutput: ...
 
     @overload
-    def __call__(self, frames: Sequence[SmplFrame]) -> list[PipelineOutput]: ...
+    def __call__(self, frames: Sequence[SmplFrame], *, margin: float | None = None) -> list[PipelineOutput]: ...
 
-    def __call__(self, frames: SmplFrame | Sequence[SmplFrame]) -> PipelineOutput | list[PipelineOutput]:
+    def __call__(
+        self, frames: SmplFrame | Sequence[SmplFrame], *, margin: float | None = None
+    ) -> PipelineOutput | list[PipelineOutput]:
         """Dresses one person, or a batch of persons (one frame each).
 
-        Arrays are read-only: persons with the same (β, θ, γ) share them, in a batch and with the last call.
+        Arrays are read-only: persons with the same (β, θ, γ) share them, in a batch and with the last call. A
+        `margin` [m] takes the place of the pipeline's.
 
         Raises:
             FrameError: `frames` isn't a frame or a sequence, or has anything but frames in it.
+            RefuError: the margin isn't zero or more.
         """
         if not isinstance(frames, SmplFrame):
             require_type(frames, Sequence, "a SmplFrame or a sequence of them", error=FrameError)
             for one in frames:
                 require_type(one, SmplFrame, "a SmplFrame in every place of the sequence", error=FrameError)
+        _check_margin(margin)
+        margin = self.margin if margin is None else margin
         with self._crew.turn() as step:
             if isinstance(frames, SmplFrame):
-                return self._dress_all(step, [frames])[0]
-            return self._dress_all(step, frames)
+                return self._dress_all(step, [frames], margin)[0]
+            return self._dress_all(step, frames, margin)
 
     def adjusted(self, frame: SmplFrame, adjust: Adjust) -> PipelineOutput:
         """Dresses one frame, and lets `adjust` change what was predicted before it is brought off the body.
@@ -244,10 +241,10 @@ class GarmentPipeline:
             msg = f"wanted a function of a Dressed, got {type(given).__name__}"
             raise FrameError(msg)
         with self._crew.turn() as step:
-            return self._run(step, [frame], self._margin, adjust)[0]
+            return self._run(step, [frame], self.margin, adjust)[0]
 
-    def _dress_all(self, step: FrameStep, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
-        margin, keys = self._margin, [_key(frame) for frame in frames]
+    def _dress_all(self, step: FrameStep, frames: Sequence[SmplFrame], margin: float | None) -> list[PipelineOutput]:
+        keys = [_key(frame) for frame in frames]
         of_margin, known = self._last
         if of_margin != margin:
             known = {}

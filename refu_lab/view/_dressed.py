@@ -61,6 +61,8 @@ class DressedFilm:
     def __init__(self, inputs: Sequence[Path], options: RecordingOptions) -> None:
         self._options = options
         self._pipeline = options.load_pipeline()
+        self._given = dict(zip(self.garments, options.garments, strict=True))
+        """What each garment was asked for by: some are files."""
         self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: drawing compares identities
         self.notes: list[str] = []
         """Warnings for the user."""
@@ -98,16 +100,14 @@ class DressedFilm:
 
     @property
     def wardrobe(self) -> tuple[str, ...]:
-        """Garments that can be worn: those made for this body or, if a body was named, all built-in ones."""
-        if self._options.body:
-            return BUILTIN_GARMENTS
-        fitting = [name for name in BUILTIN_GARMENTS if load_garment(name).body == self._pipeline.body.name]
-        return tuple(dict.fromkeys((*fitting, *self.garments)))
+        """Garments that can be worn: those asked for, and those made for this body; all, if a body was named."""
+        body = self._options.body or self._pipeline.body.name
+        fitting = [name for name in BUILTIN_GARMENTS if self._options.body or load_garment(name).body == body]
+        return tuple(dict.fromkeys((*fitting, *self._given)))
 
     def wear(self, garments: Sequence[str], sdf: str) -> None:
         """Changes the garments and the signed distance. Raises `RefuError` and then changes nothing."""
-        paths = dict(zip(self.garments, self._options.garments, strict=False))  # some were given as files
-        names = tuple(paths.get(name, name) for name in garments)
+        names = tuple(self._given.get(name, name) for name in garments)
         options = replace(self._options, garments=names, sdf=sdf)
         self._pipeline, self._options = options.load_pipeline(), options
         self._body_faces = self._pipeline.body.faces.cpu().numpy()

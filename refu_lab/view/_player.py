@@ -61,9 +61,8 @@ class Player:
         while not until():
             now = time.monotonic()
             past, last = now - last, now
-            asked = self._changed.is_set()
-            self._changed.clear()
-            if asked:
+            if asked := self._changed.is_set():
+                self._changed.clear()
                 self._rewear()
             seek, self._seek = self._seek, None
             index = self._index if seek is None else seek

@@ -45,32 +45,43 @@ def view(
     if find_spec("viser") is None:
         msg = 'the viewer needs viser: pip install "refu-ros[view]"'
         raise RefuError(msg)
-    from refu_lab.view._player import Player
+    from refu_lab.view._dressed import DressedFilm
 
     film = open_film(options, progress=progress)
-    for note in film.notes:
-        say(f"warning: {note}")
-    server = _serve(options)
-    try:
-        if isinstance(film, LiveFilm):
-            say(f"{film.title}: waiting for garments")
-            if not film.wait(until):
-                return
-        player = Player(server, film)
-        host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
-        url = f"http://{host}:{server.get_port()}"
-        what = "" if isinstance(film, LiveFilm) else f": {len(film.times)} frames"
-        say(f"{film.title}{what} at {url} (Ctrl-C ends it)")
-        if options.browser and _has_display():
-            webbrowser.open(url)
-        player.run(until=until)
-    except KeyboardInterrupt:
-        say("viewer closed")
-    finally:
-        if isinstance(film, LiveFilm):
-            film.close()
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
+    with contextlib.ExitStack() as opened:
+        if not isinstance(film, DressedFilm):
+            opened.callback(film.close)
+        for note in film.notes:
+            say(f"warning: {note}")
+        server = _serve(options)
+        opened.callback(_stop, server)
+        try:
+            _play(film, server, options, say, until)
+        except KeyboardInterrupt:
+            say("viewer closed")
+
+
+def _play(
+    film: DressedFilm | RecordedFilm | LiveFilm,
+    server: viser.ViserServer,
+    options: ViewOptions,
+    say: Callable[[str], None],
+    until: Callable[[], bool],
+) -> None:
+    from refu_lab.view._player import Player
+
+    if isinstance(film, LiveFilm):
+        say(f"{film.title}: waiting for garments")
+        if not film.wait(until):
+            return
+    player = Player(server, film)
+    host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
+    url = f"http://{host}:{server.get_port()}"
+    what = "" if isinstance(film, LiveFilm) else f": {len(film.times)} frames"
+    say(f"{film.title}{what} at {url} (Ctrl-C ends it)")
+    if options.browser and _has_display():
+        webbrowser.open(url)
+    player.run(until=until)
 
 
 def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm | LiveFilm:
@@ -105,6 +116,11 @@ def _serve(options: ViewOptions) -> viser.ViserServer:
         raise RefuError(msg)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner
         return viser.ViserServer(host=options.host, port=port, verbose=False)
+
+
+def _stop(server: viser.ViserServer) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 def _is_free(host: str, port: int) -> bool:

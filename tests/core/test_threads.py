@@ -92,23 +92,19 @@ def test_tasks_and_batches_give_what_one_thread_gives(pipeline: GarmentPipeline)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_margin_that_another_thread_sets_holds_for_whole_frames(pipeline: GarmentPipeline, threads: int) -> None:
+def test_a_call_s_margin_holds_for_that_call(pipeline: GarmentPipeline, threads: int) -> None:
     if threads > 1:
         pipeline = GarmentPipeline.load(_GARMENTS, threads=threads)
     frames, margins = _frames(4), (0.002, 0.006)
-    expected: list[list[PipelineOutput]] = []
-    for margin in margins:
-        pipeline.margin = margin
-        expected.append([pipeline(frame) for frame in frames])
+    expected = [[pipeline(frame, margin=margin) for frame in frames] for margin in margins]
+    assert not _are_equal(expected[0][0], expected[1][0])
 
     def call(i: int) -> PipelineOutput:
-        pipeline.margin = margins[i % 3 % 2]
-        return pipeline(frames[i % len(frames)])
+        return pipeline(frames[i % len(frames)], margin=margins[i % 3 % 2])
 
     with _threads(8) as threads:
         for i, out in enumerate(threads.map(call, range(16))):
-            assert any(_are_equal(out, of_margin[i % len(frames)]) for of_margin in expected)
-    pipeline.margin = None
+            assert _are_equal(out, expected[i % 3 % 2][i % len(frames)])
 
 
 def test_pipelines_of_their_own_run_beside_each_other(pipeline: GarmentPipeline) -> None:

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 import msg_adapters as adapters
 from msg_adapters.markers import MarkerMesh, encode_delete
 from refu_core import GarmentPipeline, RefuError, SmplFrame
+from refu_core.garments import load_garment, save_garment
 from refu_core.metrics import CollisionChecker
 from refu_lab.cli import main
 from refu_lab.commands.replay import RecordingOptions
@@ -199,6 +200,15 @@ def test_files_are_a_person_each_and_garments_can_be_changed(bag: Path, tmp_path
     with pytest.raises(RefuError, match="of one body"):
         film.wear(["tshirt-male", "skirt-female"], "hybrid")
     assert film.garments == ("tshirt-male",)
+
+
+def test_a_garment_given_as_a_file_is_taken_off_and_put_on_again(bag: Path, tmp_path: Path) -> None:
+    mine = str(save_garment(load_garment("tshirt-male"), tmp_path / "mine.npz"))
+    film = DressedFilm([bag], RecordingOptions(input=Path(), garments=(mine, *SHORTS), backbone="skinned"))
+    film.wear(SHORTS, "none")
+    assert "mine" in film.wardrobe
+    film.wear(("mine", *SHORTS), "none")
+    assert film.garments == ("mine", *SHORTS)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(3, 12))

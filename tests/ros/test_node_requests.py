@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from itertools import product
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from msg_adapters import BagReader, BagWriter
 from msg_adapters.axes import SMPL_COLUMNS
 from refu_core import GarmentPipeline, SmplFrame
 from refu_ros._bag_job import BagJob
+from refu_ros._requests import _fill
 from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
@@ -254,6 +256,15 @@ def test_one_bag_at_a_time_and_it_can_be_cancelled(peer: Peer, bags: Path) -> No
     assert 0 < result.frames < 20_000
     with BagReader(result.output) as bag:
         assert not bag.truncated
+
+
+def test_a_bag_that_is_cancelled_before_its_first_frame_has_no_figures() -> None:
+    result = SimpleNamespace(garments=[], vfcp_percent=[], cfmp_percent=[])
+    garments = {GARMENTS[0]: {"vfcp_percent": None, "cfmp_percent": None}}
+    _fill(result, {"frames": 0, "garments": garments, "interrupted": True, "warnings": []}, "a.mcap")
+    assert np.isnan([*result.vfcp_percent, *result.cfmp_percent]).all()
+    assert not result.success
+    assert "cancelled" in result.message
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,7 @@ def test_ends_with_the_motion(context: Context) -> None:
         ({"rate": "fast"}, "rate: wanted a number, got 'fast'"),
         ({"spacing": ".nan"}, "spacing"),
         ({"persons": "[ann, a b]"}, "persons: wanted distinct names"),
+        ({"persons": "[ann, é]"}, "persons: wanted distinct names"),
         ({"persons": "[ann, ann]"}, "persons: wanted distinct names"),
         ({"loop": 1}, "loop"),
         ({"input_axes": "left"}, "input_axes: wanted smpl or frame, got 'left'"),
