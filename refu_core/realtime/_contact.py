@@ -14,14 +14,13 @@ from refu_core.contact import (
     ContactSettings,
     Layer,
     LimbMeshes,
+    OwnSide,
     Parting,
     Press,
     Resolution,
     Resolver,
     Sheet,
-    Shins,
     StrainLimit,
-    Tent,
     Unfold,
     WayOut,
 )
@@ -29,7 +28,7 @@ from refu_core.garments import GarmentTemplate, inner_first
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
-from refu_core.sdf import ApproxSdf, MeshSdf, exact_sdf
+from refu_core.sdf import ApproxSdf, MeshSdf, SdfSample, exact_sdf
 
 
 class Worn(NamedTuple):
@@ -75,9 +74,9 @@ class ContactStage:
         self._has_room = outfit.collider is not None
         """Whether a collider makes room for cloth beside limbs."""
         if outfit.collider is not None:
-            self._shins, self._limbs = Shins(body), LimbMeshes(body)
+            self._limbs = LimbMeshes(body)
             self._skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
-            self._tents = {name: Tent(one, self._shins) for name, one in garments.items()}
+            self._own_side = {name: OwnSide(one.mesh, body.device, settings=settings) for name, one in garments.items()}
             self._press = {
                 name: Press(one.template, self._limbs, knows_arms=one.knows_arms, settings=settings)
                 for name, one in outfit.wearables.items()
@@ -113,18 +112,33 @@ class ContactStage:
             self.way_out.update(body)
         if self._has_room:
             self._limbs.update(body)
-            self._shins.update(body)
 
     def unfold(self, name: str, vertices: Tensor, rotation: Tensor) -> Tensor:
         """Vertices (V, 3) [m], levelled where folded over beside another garment, for joint rotations (24, 3, 3)."""
         return self._unfold[name](vertices, rotation) if name in self._unfold else vertices
 
     def press(self, name: str, vertices: Tensor) -> Tensor:
-        """Vertices (V, 3) [m], kept behind the shins, then drawn back to their skin where a limb comes between."""
+        """Vertices (V, 3) [m], drawn back to their skin where a limb comes between."""
+        return self._press[name](vertices, self._skin_below(name)) if self._has_room else vertices
+
+    def _skin_below(self, name: str) -> Tensor:
+        """The skin that each vertex of a garment lies on [m], shape (V, 3)."""
+        skin: Tensor = self._outfit.below[name](self._body[None])[0]
+        return skin
+
+    def own_side(self, name: str, vertices: Tensor, on_mean: Tensor, reach: float) -> tuple[Tensor, SdfSample]:
+        """Vertices (V, 3) [m], on their own side of the body where they were deep in it, and their distances.
+
+        `on_mean` is as in `Drape`; distances are known up to `reach` [m].
+        """
+        start = self._asked[name](vertices, on_mean=on_mean, reach=reach)
         if not self._has_room:
-            return vertices
-        vertices = self._tents[name](vertices)
-        return self._press[name](vertices, self._outfit.below[name](self._body[None])[0])
+            return vertices, start
+        share = self._own_side[name].share(start.distance)
+        if self._is_serial and not bool(share.any()):
+            return vertices, start
+        vertices = self._own_side[name](vertices, share, self._skin_below(name))
+        return vertices, self._asked[name](vertices, on_mean=on_mean, reach=reach)
 
     def lift(
         self, name: str, vertices: Tensor, worn: Mapping[str, Worn], *, goes_on: bool = False
@@ -158,7 +172,9 @@ class ContactStage:
         `raw` (V, 3) [m] are the vertices as they were predicted, `rest` (V, 3) [m] those of the wearer's garment in the
         rest pose, and `on_mean` is as in `Drape`.
         """
-        start = self._asked[name](vertices, on_mean=on_mean, reach=margin + ASKED_FROM)
+        given = vertices
+        vertices, start = self.own_side(name, vertices, on_mean, margin + ASKED_FROM)
+        pressed = pressed + (vertices - given)
         assert start.face is not None  # these distances are to faces
         n_clipped = (start.face < 0).sum()
         resolver = self.resolvers[name]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from refu_core.backbones import Skinned
 from refu_core.body import Surface
-from refu_core.contact import DEFAULT_CONTACT
+from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT
 from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
 from refu_core.modes import DEFAULT_MARGIN
@@ -164,7 +164,7 @@ def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> dict[str, NDArray[np.floating]]:
-    """How far limbs press the vertices of each garment towards the skin that they lie on [m], (N,).
+    """How far vertices of each garment go towards the skin that they lie on, pressed by limbs or deep inside [m], (N,).
 
     For garments worn `together`, this includes how far they are unfolded beforehand.
     """
@@ -179,7 +179,8 @@ def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> d
             raw = flat = one.vertices[0]
             if together:
                 flat = stage.unfold(name, raw, dressed.transforms.rotation[0])
-            ways[name] = stage.press(name, flat) - raw
+            pressed = stage.press(name, flat)
+            ways[name] = stage.own_side(name, pressed, one.on_mean[0], DEFAULT_MARGIN + ASKED_FROM)[0] - raw
     return {name: np.linalg.norm(way.numpy(), axis=1) for name, way in ways.items()}
 
 

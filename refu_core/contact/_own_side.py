@@ -1,0 +1,46 @@
+"""Cloth that was predicted deep in the body: it goes back to the skin that it lies on."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
+from refu_core.mesh import Connectivity
+
+
+class OwnSide:
+    """Brings cloth that is deep in the body to its own side of it.
+
+    Deep in a limb, the shortest way out says nothing: it leads to one side for a vertex and to the other for its
+    neighbour, and changes sides from frame to frame. So the deeper a vertex is, the more it goes to the skin that it
+    lies on at rest. Cloth around it goes along, less and less. All of this is continuous, and what the network has
+    predicted near the skin or outside stays where it is.
+    """
+
+    def __init__(
+        self, mesh: Connectivity, device: torch.device, *, settings: ContactSettings = DEFAULT_CONTACT
+    ) -> None:
+        """For a garment."""
+        self._settings = settings
+        ring = mesh.ring
+        self._start, self._ring = (torch.as_tensor(one).long().to(device) for one in (ring.start[:-1], ring.items))
+
+    def share(self, distance: Tensor) -> Tensor:
+        """How much of its way each vertex goes, for its signed distance [m]; both of shape (V,).
+
+        None down to a depth of `layer_reach`, and all from twice that depth on.
+        """
+        return (-distance / self._settings.layer_reach - 1).clamp(0, 1)
+
+    @torch.no_grad()
+    def __call__(self, points: Tensor, share: Tensor, skin: Tensor) -> Tensor:
+        """The garment (V, 3) [m], brought by these shares (V,) to the `skin` (V, 3) [m] that it lies on."""
+        share = share[:, None]
+        way = share * (skin - points)
+        moved = way
+        for _ in range(self._settings.around):
+            around = functional.embedding_bag(self._ring, moved, self._start, mode="mean")
+            moved = way + (1 - share) * self._settings.fade * around
+        return points + torch.renorm(moved, 2, 0, self._settings.max_displacement)
