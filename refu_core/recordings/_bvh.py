@@ -29,22 +29,28 @@ _MAX_BYTES = 256 << 20
 _MAX_JOINTS = 1000
 _CHANNELS = {f"{axis}{kind}": (kind, i) for kind in ("position", "rotation") for i, axis in enumerate("xyz")}
 _NAMES = {
-    "hip": ("upleg", "thigh", "upperleg", "femur", "hip"),
-    "knee": ("leg", "knee", "shin", "lowerleg", "lowleg", "calf", "tibia"),
+    "knee": ("shin", "shank", "knee", "lowerleg", "lowleg", "calf", "tibia", "leg"),
+    "hip": ("upleg", "thigh", "upperleg", "femur", "hip", "leg"),
     "ankle": ("ankle", "foot"),
-    "foot": ("toebase", "toe", "toes", "ball", "foot"),
+    "foot": ("toebase", "toe", "toes", "toe2", "ball", "foot"),
     "shoulder": ("arm", "upperarm", "uparm", "uarm", "shldr", "humerus", "shoulder"),
-    "elbow": ("forearm", "elbow", "lowerarm", "lowarm", "farm", "radius"),
+    "elbow": ("forearm", "elbow", "lowerarm", "lowarm", "farm", "larm", "radius"),
     "wrist": ("wrist", "hand"),
     "pelvis": ("hips", "pelvis", "hip"),
-    "neck": ("neck",),
+    "neck": ("neck", "necklower", "lowerneck", "necktwist"),
     "head": ("head",),
 }
 """Names of joints, without their side. The first name that a file has is taken, unless its joint already is another
-point. A `shoulder` is a collar in files that also have an arm, and a `foot` the ball of the foot in files that also
-have an ankle (SMPL, Kinect)."""
-_BARE = frozenset(name for names in _NAMES.values() for name in names)
+point. So a `leg` is the thigh in files that also have a shin (SOMA), a `shoulder` is a collar in files that also have
+an arm, and a `foot` the ball of the foot in files that also have an ankle (SMPL, Kinect)."""
+_BARE = frozenset(name for names in _NAMES.values() for name in names) - {"larm"}  # which is the left arm of others
+_SUFFIXES = "jnt|joint|bone|m|c"
+"""Words after a joint's name that don't belong to it; m and c are for the middle."""
+_NEAR = 0.5
+"""Greatest distance from between the hips to the joint that both hang on, for that to be the pelvis [thighs]: SMPL's is
+at a quarter, a root on the floor at two."""
 _SIDED = ("hip", "knee", "ankle", "foot", "shoulder", "elbow", "wrist")
+_POINTS = (*(f"{side}_{part}" for part in _SIDED for side in "lr"), "pelvis", "neck", "head")
 _NEEDED = tuple(f"{side}_{part}" for side in "lr" for part in ("hip", "knee", "shoulder", "elbow"))
 
 
@@ -157,7 +163,7 @@ def _placed(joints: list[_Joint], rows: Array) -> Array:
 
 
 def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: Proportions | None) -> Recording:
-    points = _points(joints)
+    points = _points(joints, places[0])
     missing = [name for name in _NEEDED if name not in points]
     if missing:
         names = ", ".join(joint.name for joint in joints[:12] if joint.name)
@@ -166,12 +172,14 @@ def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: P
     notes: list[str] = []
     scale = metres_of(list(points), places[0, list(points.values())], notes)
     seen = scale * places[:, list(points.values())]
-    notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}")
+    lost = [name for name in _POINTS if name not in points]
+    without = f"; not found by their names: {', '.join(lost)}" if lost else ""
+    notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}{without}")
     return follow(tuple(points), seen, fps=fps, axes=axes, usual="smpl", worn=worn, notes=notes)
 
 
-def _points(joints: list[_Joint]) -> dict[str, int]:
-    """The number of the joint at each point of the body."""
+def _points(joints: list[_Joint], places: Array) -> dict[str, int]:
+    """The number of the joint at each point of the body, for the `places` (J, 3) of one frame."""
     sides: dict[tuple[str, str], int] = {}
     for i, joint in enumerate(joints):
         if joint.name:
@@ -179,18 +187,41 @@ def _points(joints: list[_Joint]) -> dict[str, int]:
     points: dict[str, int] = {}
     for part, names in _NAMES.items():
         for side in ("l", "r") if part in _SIDED else ("",):
-            found = next((sides[side, name] for name in names if (side, name) in sides), None)
-            if found is not None and found not in points.values():
+            taken = points.values()
+            found = next(
+                (at for name in names if (at := sides.get((side, name))) is not None and at not in taken), None
+            )
+            if found is not None:
                 points[f"{side}_{part}" if side else part] = found
+    if "pelvis" not in points and (pelvis := _between(joints, places, points)) is not None:
+        points["pelvis"] = pelvis
     end = next((i for i, joint in enumerate(joints) if not joint.name and joint.parent == points.get("head")), None)
     if end is not None:
         points["head_top"] = end
     return points
 
 
+def _between(joints: list[_Joint], places: Array, points: dict[str, int]) -> int | None:
+    """The joint that both legs hang on, if it is near the hips, whatever its name is."""
+    if any(name not in points for name in ("l_hip", "r_hip", "l_knee")):
+        return None
+    above: list[list[int]] = []
+    for at in (points["l_hip"], points["r_hip"]):
+        chain = [at]
+        while joints[chain[-1]].parent >= 0:
+            chain.append(joints[chain[-1]].parent)
+        above.append(chain[1:])
+    both = next((i for i in above[0] if i in above[1]), None)
+    if both is None or both in points.values():
+        return None
+    left, right, knee = (places[points[name]] for name in ("l_hip", "r_hip", "l_knee"))
+    off, thigh = np.linalg.norm(places[both] - (left + right) / 2), np.linalg.norm(left - knee)
+    return both if off < _NEAR * thigh else None
+
+
 def _sided(name: str) -> tuple[str, str]:
     """The side (`l`, `r` or empty) and the rest of a joint's name, in any of the ways that tools write them."""
-    bare = re.split(r"[:|]", name)[-1]
+    bare = re.sub(rf"(?i)(?<=.)[_. -](?:{_SUFFIXES})$", "", re.split(r"[:|]", name)[-1])
     match = re.fullmatch(r"(?i)(?:.*[_. -])?(left|right)[_. -]?(.+)", bare)
     match = match or re.fullmatch(r"(?:.*[_. -])?([lLrR])(?:[_. -]|(?=[A-Z]))(.+)", bare)
     if match:
@@ -198,9 +229,9 @@ def _sided(name: str) -> tuple[str, str]:
     else:
         match = re.fullmatch(r"(?i)(.+?)[_. -](left|right|l|r)", bare) or re.fullmatch(r"(.+[a-z])(Left|Right)", bare)
         rest, side = (match[1], match[2]) if match else (bare, "")
-        rest = re.sub(r"^[A-Za-z0-9]+[_-](?=[A-Za-z])", "", rest)
+        rest = re.sub(r"^(?:[A-Za-z0-9]+[_-])+(?=[A-Za-z])", "", rest)
     rest = re.sub(r"[^a-z0-9]", "", rest.lower())
-    rest = re.sub(r"(?:bend|0*1)$", "", rest)  # the first of several bones of a limb
+    rest = re.sub(r"(?:bend|0*[01])$", "", rest)  # the first of several bones of a limb
     if not side and rest[:1] in ("l", "r") and rest not in _BARE and rest[1:] in _BARE:  # lfemur
         side, rest = rest[0], rest[1:]
     return side[:1].lower(), rest

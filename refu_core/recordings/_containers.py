@@ -5,9 +5,11 @@ from __future__ import annotations
 import bz2
 import io
 import lzma
+import math
+import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,9 +20,18 @@ from numpy.typing import NDArray
 from refu_core._files import open_file
 from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz, told
 from refu_core._pickle import PickledArrays
-from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, read_stream
+from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, bytes_of, read_stream
 from refu_core.errors import RefuError
-from refu_core.recordings._layouts import ALL_KEYS, POSE_KEYS, SUFFIXES, WANTED, is_like_known
+from refu_core.recordings._layouts import (
+    ALL_KEYS,
+    GENDERS,
+    JSON_ADVICE,
+    POSE_KEYS,
+    SUFFIXES,
+    WANTED,
+    is_like_column,
+    is_like_known,
+)
 
 Key = str | int
 _ZIP, _NPY = b"PK\x03\x04", b"\x93NUMPY"
@@ -36,6 +47,8 @@ MOST_DEPTH = 5
 """Levels of nested values that are searched; trackers write three."""
 _MOST_ITEMS = 2_000_000
 """Most items in a file's lists: a quarter of an hour of poses at 30 Hz."""
+_MOST_COLUMNS = 64 << 20
+"""Largest size of all columns together [bytes]: names of the images of 400,000 rows, 40 letters each."""
 _MOST_HELD = 256 << 20
 """Largest size of a dictionary in an array, and of unpacked data [bytes]."""
 
@@ -43,9 +56,10 @@ _MOST_HELD = 256 << 20
 class Content:
     """What a file holds: nested mappings, lists and arrays. Arrays are made when they are asked for."""
 
-    def __init__(self, root: Any, arrays: PickledArrays | None = None) -> None:
+    def __init__(self, root: Any, storage: Callable[[str], bytes] | None = None) -> None:
+        """`storage` returns the bytes that torch keeps beside its pickle, by their key."""
         self.root = root
-        self._arrays = arrays or PickledArrays()
+        self._arrays, self._columns = PickledArrays(storage), PickledArrays(storage)
         self._left = _MOST_ITEMS
         self._made: dict[int, tuple[Any, NDArray[Any]]] = {}
 
@@ -81,13 +95,28 @@ class Content:
         self._made[id(value)] = value, array  # the value is kept, so that its id is never reused
         return array
 
+    def column(self, value: Any) -> NDArray[Any] | None:
+        """The array of numbers or words that a value stands for, of one axis or two; None for anything else.
+
+        Has a budget of its own: pictures under a column's name leave the other arrays as much as before.
+        """
+        aside = Content(None)
+        aside._arrays = self._columns
+        try:
+            array = aside.array(value)
+        except ValueError:
+            return None
+        return array if 0 < array.ndim <= 2 and array.dtype.kind in "biufUS" else None
+
     def nodes(self) -> Iterator[tuple[tuple[Key, ...], Mapping[Key, Any]]]:
-        """Every mapping in the file and the path to it, from the outside inwards."""
+        """Every mapping in the file and the path to it, from the outside inwards; a shared one comes once."""
         todo: list[tuple[tuple[Key, ...], Any]] = [((), self.root)]
+        known: set[int] = set()
         for count, (path, value) in enumerate(todo):
             inside = entries(value)
-            if inside is None or count > _MOST_NODES:
+            if inside is None or count > _MOST_NODES or id(value) in known:
                 continue
+            known.add(id(value))
             if not _is_list(value):
                 yield path, inside
             if len(path) < MOST_DEPTH and len(todo) < _MOST_NODES:
@@ -95,15 +124,26 @@ class Content:
 
     def renamed(self, names: Mapping[Key, Key]) -> Content:
         """The same content with keys renamed, wherever they occur."""
+        return self.changed(lambda node: {names.get(key, key): item for key, item in node.items()})
+
+    def changed(self, change: Callable[[Mapping[Key, Any]], Mapping[Key, Any]]) -> Content:
+        """The same content with every mapping changed, and then the mappings in it; a shared one is changed once."""
+        made: dict[int, Any] = {}
 
         def other(value: Any, depth: int) -> Any:
             inside = entries(value)
             if inside is None or depth > MOST_DEPTH:
                 return value
-            found = {names.get(key, key): other(item, depth + 1) for key, item in inside.items()}
-            return list(found.values()) if _is_list(value) else found
+            if id(value) not in made:
+                made[id(value)] = value  # what holds itself stays as it is in there
+                after = inside if _is_list(value) else change(inside)
+                found = {key: other(item, depth + 1) for key, item in after.items()}
+                made[id(value)] = list(found.values()) if _is_list(value) else found
+            return made[id(value)]
 
-        return Content(other(self.root, 0), self._arrays)
+        content = Content(other(self.root, 0))
+        content._arrays, content._columns = self._arrays, self._columns
+        return content
 
 
 def _is_list(value: Any) -> bool:
@@ -125,6 +165,28 @@ def entries(value: Any) -> Mapping[Key, Any] | None:
     return None
 
 
+def words_of(value: Any) -> Sequence[str]:
+    """The words of a list, of an array of objects, or of an array of text in a pickle; empty for anything else.
+
+    Raises `ValueError` for a damaged array.
+    """
+    if isinstance(value, Record) and value.kind in ("array", "buffer"):
+        inside = value.args if value.kind == "buffer" else value.state
+        if value.kind == "array" and isinstance(inside, tuple) and len(inside) == 5:
+            inside = (inside[4], inside[2], inside[1])
+        raw, kind, *_ = inside if isinstance(inside, tuple) and len(inside) > 2 else (None, None)
+        value = raw
+        code = kind.args[0] if isinstance(kind, Record) and kind.kind == "dtype" and kind.args else None
+        if isinstance(code, str) and re.fullmatch("[US][1-9][0-9]{0,3}", code):
+            try:
+                value = np.frombuffer(bytes_of(raw)[:_MOST_COLUMNS], code).tolist()
+            except DAMAGE as cause:
+                raise ValueError(told(cause)) from cause
+    if not _is_list(value) or not all(type(one) in (str, bytes) for one in value):
+        return []
+    return [one.decode("utf-8", "replace") if isinstance(one, bytes) else one for one in value]
+
+
 def open_content(path: Path, *, error: type[RefuError]) -> Content:
     """Opens a file of any supported kind. Raises `error` for one that can't be read."""
     with open_file(path, most=1 << 32, error=error, wanted=WANTED) as file:
@@ -144,12 +206,13 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
             root = Unpickler(data).load()
             if type(root) is int and root == STREAM_MAGIC:
                 root, storage = read_stream(data)
-                return Content(root, PickledArrays(storage))
+                return Content(root, storage)
             return Content(root)
         except DAMAGE as cause:
             is_other = path.suffix and path.suffix.lower() not in SUFFIXES
             why = f"no file of motion is a {path.suffix}" if is_other else told(cause)
-            msg = f"{path}: can't be read: {why}; wanted {WANTED}"
+            hint = JSON_ADVICE if path.suffix.lower() == ".json" else ""
+            msg = f"{path}: can't be read: {why}; wanted {WANTED}{hint}"
             raise error(msg) from cause
 
 
@@ -159,10 +222,11 @@ def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
         for name in names:  # a dictionary that NumPy has pickled into an array
             held = _object(path, name)
             if held is not None:
-                return Content({**read_npz(path, keys=wanted, error=error, wanted=WANTED), name: held})
+                return Content({**_arrays(path, wanted, error), name: held})
         wanted |= {name for name in names if is_like_known(_steps(name)[-1])}
-    root: dict[Key, Any] = dict.fromkeys(name for name in names if name not in wanted)
-    for name, array in read_npz(path, keys=wanted, error=error, wanted=WANTED).items():
+    arrays = _arrays(path, wanted, error)
+    root: dict[Key, Any] = dict.fromkeys(name for name in names if name not in arrays)
+    for name, array in arrays.items():
         node = root
         *above, last = _steps(name)
         for step in above:
@@ -170,6 +234,38 @@ def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
             node = inner if isinstance(inner, dict) else {}
         node[last] = array
     return Content(root)
+
+
+def _arrays(path: Path, names: set[str], error: type[RefuError]) -> dict[str, NDArray[Any]]:
+    """The arrays of these names; of those named like columns, only what is one. Raises `error` for damaged ones."""
+    like = {name for name in names if is_like_column(_steps(name)[-1])}
+    columns = _columns(path, like, error)
+    # A gender that isn't one mustn't be overlooked.
+    apart = {name for name in like if name in columns or _steps(name)[-1] not in GENDERS}
+    return read_npz(path, keys=names - apart, error=error, wanted=WANTED) | columns
+
+
+def _columns(path: Path, names: Collection[str], error: type[RefuError]) -> dict[str, NDArray[Any]]:
+    columns: dict[str, NDArray[Any]] = {}
+    left = _MOST_COLUMNS
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for entry in archive.infolist():
+                name = entry.filename.removesuffix(".npy")
+                is_plain = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+                if name not in names or not is_plain or entry.file_size > left:
+                    continue
+                left -= entry.file_size
+                data = archive.read(entry)
+                if b"'|O'" in data[:128]:
+                    continue
+                shape, dtype = check_npy(io.BytesIO(data), len(data))
+                if shape and max(shape) == math.prod(shape) and dtype.kind in "biufUS":
+                    columns[name] = npy.read_array(io.BytesIO(data), allow_pickle=False)
+    except DAMAGE as cause:
+        msg = f"{path}: can't be read as .npz: {told(cause)}; wanted {WANTED}"
+        raise error(msg) from cause
+    return columns
 
 
 def _steps(name: str) -> list[str]:
@@ -224,7 +320,7 @@ def _torch(path: Path, error: type[RefuError]) -> Content:
             name = next(name for name in archive.namelist() if name.endswith("data.pkl"))
             folder = name.rpartition("/")[0]
             tree = Unpickler(io.BytesIO(_member(archive, name))).load()
-        return Content(tree, PickledArrays(storage))
+        return Content(tree, storage)
     except DAMAGE as cause:
         msg = f"{path}: can't be read as a file of torch: {told(cause)}; wanted {WANTED}"
         raise error(msg) from cause

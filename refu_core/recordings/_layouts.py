@@ -39,6 +39,8 @@ class Layout:
     """Whether the pose consists of places of joints instead of rotations."""
     counts: tuple[int, ...] = ()
     """Numbers of joints or points, where they aren't SMPL's."""
+    has_age: bool = False
+    """Whether an eleventh beta is the share of a child (SMPL+A) instead of one more of the shape."""
     turns_about_origin: bool = False
     """Whether the root turns the body about the origin of its mesh instead of its pelvis."""
 
@@ -75,7 +77,13 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="smplx, GVHMR, 4DHumans, HMR 2", pose=("global_orient", "body_pose")),
     Layout(writers="EMDB", pose=("poses_root", "poses_body")),
     Layout(writers="AIST++", pose=("smpl_poses",), transl=("smpl_trans",)),
-    Layout(writers="ROMP, BEV, TRACE", pose=("smpl_thetas",), transl=("cam_trans",), betas=("smpl_betas",)),
+    Layout(
+        writers="ROMP, BEV, TRACE",
+        pose=("smpl_thetas",),
+        transl=("cam_trans",),
+        betas=("smpl_betas",),
+        has_age=True,
+    ),
     Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",)),
     Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",)),
     Layout(writers="PHC and other humanoid controllers", pose=("pose_aa",), transl=("trans_orig", "trans")),
@@ -101,7 +109,10 @@ OF_SMPLX = ("global_orient", "body_pose")
 """Arrays that are SMPL-X's if they hold 22 joints; AMASS's arrays of 22 joints may also be SMPL-H's."""
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate", "frameRate", "FPS")
 GENDERS = ("gender", "genders")
-FRAME_NUMBERS = ("frame_ids", "frame_id")
+FRAME_NUMBERS = ("frame_ids", "frame_id", "frame_idx", "frame", "frames")
+"""Numbers of the frames, where a tracker may have lost some. Other files have pictures or a count under these names."""
+IMAGES = ("imgname", "img_name", "image_name", "img_path", "image_path")
+"""Names of the images that the rows of a table were seen in: a folder for each sequence, a number at the end."""
 LENGTHS = "lengths"
 """How many frames each sample of a batch has; the rest is padding."""
 SCALINGS = ("smpl_scaling",)
@@ -111,12 +122,16 @@ MODELS = ("surface_model_type",)
 SOMA_NAMES = "joint_names"
 _SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_coeffs")
 TRACK_IDS = ("track_id", "person_id", "tid", "id")
+PERSONS = (*TRACK_IDS, "track_ids", "person_ids", "sub", "subject")
+"""Whose each row of a table is."""
+COLUMNS = (*FRAME_NUMBERS, *IMAGES, *PERSONS, *GENDERS)
+"""Names under which a number or a word for each row may stand, and in other files anything else."""
 
 POSE_KEYS = frozenset(name for layout in LAYOUTS if layout.is_whole for name in layout.pose)
 """Names of the arrays of whole poses."""
 ALL_KEYS = frozenset(
     {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
-    | {*RATES, *GENDERS, *FRAME_NUMBERS, LENGTHS, *SCALINGS, *MODELS, *_SOMA}
+    | {*RATES, *COLUMNS, LENGTHS, *SCALINGS, *MODELS, *_SOMA}
 )
 """Names of everything that is read; all else in a file, such as meshes and pictures, is left unread."""
 
@@ -127,11 +142,18 @@ def spelled(key: object) -> str:
 
 
 _SPELLED = {spelled(name): name for name in sorted(ALL_KEYS)}
+_POSES = tuple(spelled(layout.pose[0]) for layout in LAYOUTS)
+_COLUMNS = tuple(map(spelled, COLUMNS))
 
 
 def is_like_known(key: object) -> bool:
     """Whether a name ends with a known one, however it is spelled."""
     return spelled(key).endswith(tuple(_SPELLED))
+
+
+def is_like_column(key: object) -> bool:
+    """Whether a name ends with a column's, however it is spelled."""
+    return spelled(key).endswith(_COLUMNS)
 
 
 def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
@@ -140,6 +162,8 @@ def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
     Trackers write `smpl_body_pose`, `globalOrient` and `Body-Pose`.
     """
     by_spelling = {spelled(key): key for key in keys}
+    if not any(word.endswith(_POSES) for word in by_spelling):
+        return {}
     for layout in LAYOUTS:
         first, *others = map(spelled, layout.pose)
         for word in by_spelling:
@@ -167,6 +191,8 @@ UNREAD_ADVICE = {
 }
 
 WANTED = "a motion: .npz, .npy, .pkl, .pt of an estimator or archive, or .bvh (docs/guide/inputs.md lists them)"
+
+JSON_ADVICE = "; save the arrays of EasyMocap's .json as .npz, as that page shows"
 
 
 def accepted() -> str:

@@ -14,8 +14,6 @@ _PLACES = dict(zip(_BODY.split(), range(21), strict=True))
 _PLACES |= {"r_index": 28, "r_pinky": 40, "r_wrist": 41, "l_index": 49, "l_pinky": 61, "l_wrist": 62, "neck": 69}
 """Which of the 70 each point of the keypoint layouts is; on a hand they are the knuckles, since fingers bend."""
 POINTS = tuple(_PLACES)
-_MOST_LOST = 100
-"""Most frames in all for each one in which the person is seen; frame numbers that claim more are ignored."""
 
 
 def is_of_mhr(keypoints: NDArray[Any]) -> bool:
@@ -34,7 +32,7 @@ def places_of_mhr(
         at: which of the T frames they are, (N,); None for all.
     """
     seen = keypoints.reshape(-1, N_KEYPOINTS, 3).astype(np.float64)[:, list(_PLACES.values())] + place[:, None]
-    if at is None or at[-1] > _MOST_LOST * len(at):
+    if at is None:
         return seen
     places = np.full((int(at[-1]) + 1, *seen.shape[1:]), np.nan)
     places[at] = seen

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,39 +14,23 @@ from refu_core.frames import N_JOINTS
 from refu_core.keypoints import Proportions
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._bvh import read_bvh
-from refu_core.recordings._containers import Content, Key, entries, open_content
+from refu_core.recordings._containers import Content, Key, open_content
+from refu_core.recordings._find import chosen, find_motion, first, person_of, with_known_names
 from refu_core.recordings._followed import SMPL_POINTS, are_places, follow, metres_of
-from refu_core.recordings._mhr import POINTS, is_of_mhr, places_of_mhr
+from refu_core.recordings._mhr import POINTS, places_of_mhr
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, not_finite, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
-from refu_core.recordings._tracks import filled, frames_of, places_in_time
+from refu_core.recordings._tables import numbers_of
+from refu_core.recordings._tracks import filled, places_in_time
 from refu_core.recordings._upright import AXES, PELVIS, PELVIS_OF_SMPLX, Axes, to_smpl
 from refu_core.recordings._values import betas_of, fps_of, gender_of, transl_of, turned, word_of
 
+_SMPLH_JOINTS, _SMPLX_JOINTS = 52, 55
 _BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
-_WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
-_SHOWN = 8
 _ROOTS = ("root", "orient", "globalrot")
 _NO_ROOTS = ("trans", "pos", "loc", "vel")
 """Parts of the names of roots, and parts that show that such a name means something else."""
-
-
-@dataclass(frozen=True)
-class _Found:
-    """A mapping with the arrays of a layout."""
-
-    layout: table.Layout
-    path: tuple[Key, ...]
-    node: Mapping[Key, Any]
-
-    @property
-    def rank(self) -> tuple[int, int]:
-        """Motion in the world ranks before motion in a camera; then the order of the table decides."""
-        words = [str(step).lower() for step in self.path]
-        is_world = any(word in step for step in words for word in _WORLD)
-        is_camera = any(word in step for step in words for word in _CAMERA)
-        return (0 if is_world else 2 if is_camera else 1), table.LAYOUTS.index(self.layout)
 
 
 def read_recording(
@@ -95,10 +78,10 @@ def _recording(
     content: Content, *, fps: float | None, axes: Axes, person: str | None, worn: Proportions | None
 ) -> Recording:
     notes: list[str] = []
-    content, like = _spelled(smpl_of_soma(content, notes, PELVIS if worn is None else worn.joints[0]))
+    content, like = with_known_names(smpl_of_soma(content, notes, PELVIS if worn is None else worn.joints[0]))
     if like:
         notes.append(f"taken by like names: {', '.join(f'{key} as {name}' for key, name in like.items())}")
-    found, above = _find(content, person, notes)
+    found, above = find_motion(content, person, notes)
     layout, node = found.layout, found.node
     arrays = {name: content.array(node[name]) for name in layout.pose}
     if layout.is_time_last:
@@ -106,9 +89,9 @@ def _recording(
     if layout.holds_places:
         arrays = {name: _by_time(array) for name, array in arrays.items()}
     n_persons = _persons(arrays)
-    persons = [str(i) for i in range(n_persons)] or [_person(found.path)]
+    persons = [str(i) for i in range(n_persons)] or [person_of(found.path)]
     is_asked = n_persons > 1 or person is not None
-    which = _chosen(persons, person, [0] * len(persons), notes) if is_asked else 0
+    which = chosen(persons, person, [0] * len(persons), notes) if is_asked else 0
     if n_persons:
         arrays = {name: array[which] for name, array in arrays.items()}
     if layout.holds_places:
@@ -126,13 +109,22 @@ def _recording(
         return array[which] if n_persons and len(array) == n_persons and array.ndim > 1 else array
 
     def rate() -> float:
-        return check_fps(fps if fps is not None else fps_of(content, _first(above, table.RATES)))
+        return check_fps(fps if fps is not None else fps_of(content, first(above, table.RATES)))
 
-    frames = one(table.FRAME_NUMBERS)
+    def numbers(n: int) -> NDArray[Any] | None:
+        """The frames' numbers, beside the pose or, if there are as many, around it."""
+        for place in above:
+            array = numbers_of(content, place)
+            if array is not None and n_persons and array.ndim > 1 and len(array) == n_persons:
+                array = array[which]
+            if array is not None and (place is node or array.size == n):
+                return array
+        return None
+
     if layout is table.MHR:
         (array,) = arrays.values()
         notes.append("MHR, another body than SMPL's: followed by its keypoints")
-        at = places_in_time(frames, len(array), notes)
+        at = places_in_time(numbers(len(array)), len(array), notes)
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
         return follow(POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
     if layout.holds_places or _is_of_places(arrays):
@@ -141,7 +133,7 @@ def _recording(
         places = array[:, : len(SMPL_POINTS)].astype(np.float64)
         places = metres_of(SMPL_POINTS, places[0], notes) * places
         return follow(SMPL_POINTS, places, fps=rate(), axes=axes, usual="smpl", worn=worn, notes=notes)
-    poses = _poses(arrays, layout, node, notes)
+    poses, n_joints = _poses(arrays, layout, node, notes)
     n = len(poses)
     transl = transl_of(one(layout.transl), layout, n, notes)
     scaling = one(table.SCALINGS)
@@ -150,13 +142,15 @@ def _recording(
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
     is_smplx = (
         any("smplx" in table.spelled(key) for key in like)
-        or "x" in word_of(content, _first(above, table.MODELS))
-        or _columns(arrays) in (165, 330, 495)
-        or (layout.pose == table.OF_SMPLX and _columns(arrays) in (66, 132, 198))
+        or "x" in word_of(content, first(above, table.MODELS))
+        or n_joints == _SMPLX_JOINTS
+        or (layout.pose == table.OF_SMPLX and n_joints == _BODY_JOINTS)
     )
-    betas = betas_of(one(layout.betas), n, notes, is_smplx=is_smplx)
+    betas = betas_of(one(layout.betas), n, notes, has_age=layout.has_age)
     pelvis = PELVIS if worn is None else worn.of(betas.astype(np.float64))[0]
     is_low = pelvis[1] < (PELVIS + PELVIS_OF_SMPLX)[1] / 2  # the given body may be SMPL-X's, too
+    if is_smplx and betas.any() and not is_low:
+        notes.append("betas are SMPL-X's: another shape space than SMPL's")
     theirs = PELVIS_OF_SMPLX if is_smplx and transl.any() and not is_low else pelvis
     if layout.turns_about_origin:
         transl = transl + turned(theirs, poses[:, 0]) - pelvis
@@ -164,8 +158,8 @@ def _recording(
         transl = transl + theirs - pelvis
     if theirs is not pelvis:
         notes.append("SMPL-X's mesh has its pelvis 13 cm lower than SMPL's: translations are changed by that")
-    poses, transl = filled(poses, transl, frames, notes)
-    of_amass = _columns(arrays) in (156, 165) and _first(above, table.RATES[:2]) is not None
+    poses, transl = filled(poses, transl, numbers(n), notes)
+    of_amass = n_joints in (_SMPLH_JOINTS, _SMPLX_JOINTS) and first(above, table.RATES[:2]) is not None
     roots = poses[:, 0].astype(np.float64)
     usual: Axes = "z-up" if of_amass else "smpl"
     roots, transl = to_smpl(roots, transl, axes, notes, usual=usual, pelvis=pelvis)
@@ -179,7 +173,7 @@ def _recording(
         notes.append(
             f"NaN or infinite in {len(bad)} of {len(poses)}, first in number {bad[0]}: nobody is dressed there"
         )
-    gender = gender_of(word_of(content, _first(above, table.GENDERS), which), notes)
+    gender = gender_of(word_of(content, first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, hertz, gender, tuple(notes))
 
@@ -208,71 +202,6 @@ def _is_of_places(arrays: Mapping[str, NDArray[Any]]) -> bool:
     return is_alike and len(array) > 0 and are_places(array.astype(np.float64))
 
 
-# Where the motion is --------------------------------------------------------------------------------------------------
-
-
-def _find(content: Content, person: str | None, notes: list[str]) -> tuple[_Found, list[Mapping[Key, Any]]]:
-    """The mapping that holds the motion, and the mappings around it, from the inside outwards."""
-    if isinstance(content.root, np.ndarray):
-        notes.append("an array without a name: taken as poses")
-        bare: dict[Key, Any] = _bare(content.root, notes)
-        poses = next(layout for layout in table.LAYOUTS if layout.pose == ("poses",))
-        return _Found(poses, (), bare), [bare]
-    tracks = frames_of(content)
-    whole = entries(content.root) or {}  # a frame rate may stand here, beside the frames
-    if tracks:
-        notes.append("the file goes frame by frame: each person's frames are put together")
-        content = Content(tracks)
-    nodes = dict(content.nodes())
-    every = [
-        _Found(layout, path, node)
-        for path, node in nodes.items()
-        for layout in table.LAYOUTS
-        if all(node.get(name) is not None for name in layout.pose)
-        and (layout is not table.MHR or is_of_mhr(content.array(node[layout.pose[0]])))
-    ]
-    if not every:
-        raise ValueError(_unknown(nodes))
-    best = min(found.rank for found in every)
-    same = [found for found in every if found.rank == best]
-    others = {" with ".join(found.layout.pose) for found in every if found.rank[0] != best[0]}
-    is_both = best[1] == 0 and any("camera" in found.layout.writers for found in every)
-    if is_both or (best[0] == 0 and others):
-        notes.append("the file has the motion in a camera, too: the one in the world is taken")
-    names = [_person(found.path) for found in same]
-    lengths = [content.array(found.node[found.layout.pose[0]]).shape[:1] for found in same]
-    found = same[_chosen(names, person, [sum(length) for length in lengths], notes) if len(same) > 1 else 0]
-    return found, [nodes[found.path[:i]] for i in range(len(found.path), -1, -1) if found.path[:i] in nodes] + [whole]
-
-
-def _spelled(content: Content) -> tuple[Content, Mapping[Key, str]]:
-    """The content with known names, and which were changed, where a pose's are spelled differently or have a prefix."""
-    names = None
-    for _, node in content.nodes():
-        exact = [one for one in table.LAYOUTS if all(node.get(name) is not None for name in one.pose)]
-        if any(one.is_whole for one in exact):
-            return content, {}
-        known = table.names_like([key for key, value in node.items() if value is not None])
-        names = names or known
-    return (content.renamed(names), names) if names else (content, {})
-
-
-def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
-    """An array without a name: a pose, or the columns of Motion-X."""
-    if array.ndim == 2 and array.shape[1] == 322:
-        notes.append("322 columns: taken as Motion-X's")
-        arrays: dict[Key, Any] = {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
-        return arrays | {table.MODELS[0]: "smplx"}
-    if array.ndim == 2 and array.shape[1] == 263:
-        msg = f"263 columns are HumanML3D features; {table.UNREAD_ADVICE['HumanML3D features']}"
-        raise ValueError(msg)
-    return {"poses": array}
-
-
-def _person(path: tuple[Key, ...]) -> str:
-    return next((str(step) for step in reversed(path) if isinstance(step, int)), "/".join(map(str, path)) or "0")
-
-
 def _persons(arrays: Mapping[str, NDArray[Any]]) -> int:
     """How many persons are along the first axis (SLAHMR), 0 where there is no such axis."""
     ways = [3 * n for n in (*WHOLE, *BODY)]
@@ -281,44 +210,10 @@ def _persons(arrays: Mapping[str, NDArray[Any]]) -> int:
     return len(batched[0]) if batched else 0
 
 
-def _chosen(names: Sequence[str], person: str | None, lengths: Sequence[int], notes: list[str]) -> int:
-    listing = ", ".join(f"{name} ({n} frames)" if n else name for name, n in zip(names[:_SHOWN], lengths, strict=False))
-    listing += " …" if len(names) > _SHOWN else ""
-    if person is not None:
-        if person not in names:
-            msg = f"no person {person!r}; the file has " + (listing if len(names) > 1 else "one: leave the person out")
-            raise ValueError(msg)
-        return names.index(person)
-    best = max(range(len(names)), key=lambda i: lengths[i])
-    notes.append(f"{len(names)} persons: {listing}; {names[best]} is taken (--person chooses another)")
-    return best
-
-
-def _unknown(nodes: Mapping[tuple[Key, ...], Mapping[Key, Any]]) -> str:
-    keys = list(dict.fromkeys(str(key) for node in list(nodes.values())[:_SHOWN] for key in node))
-    for what, names in table.UNREAD.items():
-        if any(name in keys for name in names):
-            return f"{what} parameters aren't read: {table.UNREAD_ADVICE[what]}"
-    has = ", ".join(keys[:_SHOWN]) + (" …" if len(keys) > _SHOWN else "") or "nothing that has a name"
-    return f"no poses; wanted {table.accepted()} (docs/guide/inputs.md); the file has {has}"
-
-
-def _first(above: Sequence[Mapping[Key, Any]], names: Sequence[str]) -> Any:
-    """The first entry with one of these names, from the mapping nearest to the motion."""
-    return next((node[name] for node in above for name in names if node.get(name) is not None), None)
-
-
-# What the arrays mean -------------------------------------------------------------------------------------------------
-
-
-def _columns(arrays: Mapping[str, NDArray[Any]]) -> int:
-    return sum(int(np.prod(array.shape[1:])) for array in arrays.values())
-
-
 def _poses(
     arrays: Mapping[str, NDArray[Any]], layout: table.Layout, node: Mapping[Key, Any], notes: list[str]
-) -> NDArray[np.float64]:
-    """Rotation vectors of SMPL's 24 joints, from any layout."""
+) -> tuple[NDArray[np.float64], int]:
+    """Rotation vectors of SMPL's 24 joints, from any layout, and how many joints that has, the root included."""
     names, given = list(arrays), list(arrays.values())
     if len(given) == 2:
         root, _ = rotvecs_of(given[0], names[0], (1,), notes, has_root=True)
@@ -353,4 +248,4 @@ def _poses(
         raise ValueError(msg)
     poses = np.zeros((len(body), N_JOINTS, 3))
     poses[:, :1], poses[:, 1 : 1 + kept] = root, body[:, :kept]
-    return poses
+    return poses, 1 + n

@@ -18,6 +18,11 @@ FASTEST, _FARTHEST = 12.0, 50.0
 centimetres exceed it."""
 
 
+_JUMP = 0.75
+"""A step of a frame that is farther and faster than people run is a jump [m]; trackers lose people there, too."""
+_OF_OTHERS = "several people's rows? say whose each is in a column, track_id; or the tracker lost the person there"
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One person moving, sampled evenly, in SMPL's axes (y up) unless the reader was told to keep the file's axes."""
@@ -77,14 +82,28 @@ def not_finite(poses: NDArray[np.floating], transl: NDArray[np.floating]) -> NDA
 
 
 def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> None:
-    """Adds a note if translations (T, 3) [m], at `rate` frames a second, can't be a person's in metres."""
+    """Adds a note if translations (T, 3) [m], at `rate` frames a second, can't be one person's in metres."""
     with np.errstate(over="ignore", invalid="ignore"):
         steps, away = np.linalg.norm(np.diff(transl, axis=0), axis=1), np.linalg.norm(transl, axis=1)
-    steps, away = steps[np.isfinite(steps)], away[np.isfinite(away)]
-    pace = rate * float(np.median(steps)) if len(steps) else 0.0
+    is_known, away = np.isfinite(steps), away[np.isfinite(away)]
+    pace = rate * float(np.median(steps[is_known])) if is_known.any() else 0.0
     far = float(np.median(away)) if len(away) else 0.0
-    if pace > FASTEST or far > _FARTHEST:
+    jumps = np.flatnonzero(is_known & (steps > max(_JUMP, FASTEST / rate)))
+    if pace > FASTEST and far <= _FARTHEST and _is_to_and_fro(transl, pace / rate):
+        notes.append(f"the person jumps to and fro by {pace / rate:.1f} m: {_OF_OTHERS}")
+    elif pace > FASTEST or far > _FARTHEST:
         notes.append(
             f"the person moves by {pace:.1f} m/s, {far:.0f} m from the origin: divide the translation by 100 or 1000 "
             "if it is in cm or mm"
         )
+    elif len(jumps):
+        often = f" and {len(jumps) - 1} times later" if len(jumps) > 1 else ""
+        notes.append(f"the person jumps by {steps[jumps[0]]:.1f} m after frame {jumps[0]}{often}: {_OF_OTHERS}")
+
+
+def _is_to_and_fro(transl: NDArray[np.float64], step: float) -> bool:
+    """Whether two frames lead about as far as one, a `step` [m]: a person who walks gets twice as far."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        twice = np.linalg.norm(transl[2:] - transl[:-2], axis=1)
+    twice = twice[np.isfinite(twice)]
+    return bool(len(twice)) and float(np.median(twice)) < 1.5 * step

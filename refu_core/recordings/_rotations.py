@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from refu_core.keypoints import LAYOUTS, keypoint_layout
+
 Array = NDArray[np.float64]
 
 WHOLE = (24, 22, 52, 55)
@@ -16,6 +18,14 @@ WHOLE = (24, 22, 52, 55)
 BODY = (23, 21, 51, 54)
 """The same without the root."""
 _FORMS = {3: "rotation vectors", 9: "matrices", 6: "6D rotations", 4: "quaternions"}
+_N_LATENT = 32
+"""Numbers of VPoser's latent pose [1]."""
+_ADVICE = {
+    75: "72 columns of a pose and 3 of a translation: save them apart, as poses and trans",
+    82: "72 columns of a pose and 10 of a shape: save them apart, as poses and betas",
+    85: "3 columns of a camera, 72 of a pose, 10 of a shape (VIBE): save the latter two apart, as poses and betas",
+}
+"""What arrays of so many columns may be; the order of the columns differs between programs, so it isn't guessed."""
 LONGEST_TURN = 2 * np.pi + 0.1
 """An unwrapped rotation vector may be this long [rad]; the median of sound ones is never longer."""
 _MOST_SKEW = 0.05  # largest entry of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
@@ -78,14 +88,29 @@ def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int,
             elif shape in ways:
                 found.append((size, n, 1))
     if not found or not array.size:
-        per = " | ".join(str(n) for n in counts)
-        msg = (
-            f"{name} must be (T, n, 3) or (T, n*3) rotation vectors [rad], (T, n, 3, 3) or (T, n*9) matrices, or "
-            f"(T, n, 6) or (T, n*6), with T > 0 and n = {per} joints, got {shape}"
+        per, advice = " | ".join(str(n) for n in counts), _advice(shape)
+        wanted = (
+            f"rotations of n = {per} joints"
+            if advice
+            else (
+                "(T, n, 3) or (T, n*3) rotation vectors [rad], (T, n, 3, 3) or (T, n*9) matrices, or "
+                f"(T, n, 6) or (T, n*6), with T > 0 and n = {per} joints"
+            )
         )
+        msg = f"{name} must be {wanted}, got {shape}{advice}"
         raise ValueError(msg)
     # (24, 3) is one frame of SMPL: for 24 frames of a root, the caller would have asked for the count 1.
     return next((form for form in found if form[0] != 4), found[0])
+
+
+def _advice(shape: tuple[int, ...]) -> str:
+    """What to do about an array that looks like something else than rotations; empty if it doesn't."""
+    if shape[-1:] == (_N_LATENT,) and len(shape) <= 2:
+        return ", which looks like VPoser's latent pose: save what VPoser decodes it to"
+    if len(shape) > 2 and shape[-1] == 3 and shape[-2] in {len(keypoint_layout(name)) for name in LAYOUTS}:
+        return ", which looks like keypoints: publish them, or use KeypointTracker (docs/guide/inputs.md, Keypoints)"
+    advice = _ADVICE.get(shape[-1] if shape else 0)
+    return f", which looks like {advice}" if advice and len(shape) == 2 else ""
 
 
 def _check_radians(vectors: Array, name: str) -> None:

@@ -17,6 +17,9 @@ from refu_core.recordings._rotations import is_one_frame
 
 _SAME = 0.75
 """Anybody farther than this from where a person was last seen is somebody else [m]; the same as for trackers."""
+_MOST_LOST = 100
+"""Most frames in all for each one in which the person is seen [1]; numbers that claim more, as time stamps do, would
+fill the memory."""
 _HOLDERS = (dict, list, tuple, Record)
 """Types that hold other values; most values of a file are numbers, and aren't searched."""
 _MOST_LOOKS = 200_000
@@ -73,8 +76,8 @@ def places_in_time(frames: NDArray[Any] | None, n: int, notes: list[str]) -> NDA
     elif len(falls := np.flatnonzero(given[1:] <= given[:-1])):
         first = falls[0]
         what = f"{given[first]} is followed by {given[first + 1]}; wanted one person's, rising"
-    elif n and int(given[-1]) - int(given[0]) >= MAX_FRAMES:
-        what = f"from {given[0]} to {given[-1]}, at most {MAX_FRAMES} are read"
+    elif n and int(given[-1]) - int(given[0]) >= (most := min(MAX_FRAMES, _MOST_LOST * n)):
+        what = f"from {given[0]} to {given[-1]}, at most {most} for {n} frames are read"
     else:
         at: NDArray[np.int64] = (given - given[:1]).astype(np.int64)
         return None if n < 2 or at[-1] == n - 1 else at

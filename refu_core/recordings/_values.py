@@ -40,8 +40,10 @@ def transl_of(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: l
     return array.reshape(n, 3).astype(np.float64)
 
 
-def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: bool) -> NDArray[np.float32]:
+def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, has_age: bool = False) -> NDArray[np.float32]:
     """The first 10 coefficients, with the mean shape's zeros for missing ones. A person has one shape: the median.
+
+    `has_age` says that an eleventh is SMPL+A's, between an adult (0) and a child (1): it is left out, which is noted.
 
     Raises `ValueError` for an array of another shape, and for numbers that aren't finite.
     """
@@ -53,7 +55,11 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: 
         msg = f"betas must be one row of coefficients, or a row for each of {n} frames, got {array.dtype} {array.shape}"
         raise ValueError(msg)
     rows = np.atleast_1d(array).astype(np.float64)
-    rows = rows.reshape(-1, rows.shape[-1])[:, :N_BETAS]
+    rows = rows.reshape(-1, rows.shape[-1])
+    if has_age and rows.shape[1] == N_BETAS + 1 and len(rows) and np.any(rows[:, -1]):
+        age = float(np.median(rows[:, -1]))
+        notes.append(f"the eleventh beta, a child's share of the shape ({age:.2g}), is left out: an adult's body")
+    rows = rows[:, :N_BETAS]
     if len(rows) > 1:
         spread = float(np.ptp(rows, axis=0).max(initial=0.0))
         if spread > _STEADY:
@@ -63,8 +69,6 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, is_smplx: 
     if not np.isfinite(betas).all():
         msg = "betas has values that are NaN or infinite, or too large for float32"
         raise ValueError(msg)
-    if is_smplx and betas.any():
-        notes.append("betas are SMPL-X's: another shape space than SMPL's")
     return betas
 
 

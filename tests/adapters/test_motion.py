@@ -52,6 +52,7 @@ def test_layouts(tmp_path: Path, columns: int) -> None:
     lower = [0.003, -0.131, -0.008] if columns == 165 else [0.0, 0.0, 0.0]  # SMPL-X's pelvis, in its mesh
     np.testing.assert_allclose(motion.transl, trans + lower, rtol=0, atol=1e-12)
     assert (motion.fps, motion.gender) == (120.0, "male")
+    assert repr(motion).endswith(f"a.npz: {T} frames at 120 Hz, male)")
     frames = list(motion.frames())
     assert [f.stamp_ns for f in frames[:4]] == [0, 8333333, 16666667, 25000000]
     np.testing.assert_array_equal(frames[3].pose, motion.poses[3])

@@ -18,6 +18,7 @@ from msg_adapters import MotionFileError, read_motion
 from refu_core import load_body
 from refu_core.recordings._tracks import _who_is_who
 from refu_core.skeleton import JOINT_NAMES
+from tests.limits import run_limited
 
 
 def person(i: int, shift: float = 0.0) -> dict[str, Any]:
@@ -62,6 +63,133 @@ def test_people_without_names_are_told_apart_by_where_they_are() -> None:
     seen = [[("", nowhere), ("a", here)], [("", here)], [("1", there)], [("", np.array([9.0, 0, 0]))]]
     assert list(_who_is_who(seen)) == [["0", "a"], ["a"], ["1"], ["3"]]
     assert list(_who_is_who([[("1", here)], [("", there)]])) == [["1"], ["2"]]
+
+
+# Tables -----------------------------------------------------------------------------------------------------------
+
+AWAY = np.array([2.5, 0, 0])
+
+
+def table(order: NDArray[np.int64], **columns: Any) -> dict[str, Any]:
+    """Rows of two people, T each: the first one's, then the second one's, who is 2.5 m away; in another order."""
+    arrays = {"pose": np.concatenate([POSES, POSES[::-1]]).reshape(2 * T, 72), "trans": np.concatenate([TRANSL] * 2)}
+    arrays["trans"][T:] += AWAY
+    arrays["betas"] = np.repeat([np.full(10, 0.5), np.full(10, -0.5)], T, axis=0)
+    return {name: np.asarray(array)[order] for name, array in (arrays | columns).items()}
+
+
+def images(frames: Any, folder: str = "seq") -> list[str]:
+    return [f"{folder}/{folder}_{i:04}.png" for i in frames]
+
+
+TWICE = np.tile(np.arange(T), 2)
+COLUMNS: dict[str, dict[str, Any]] = {
+    "CoMotion": {"id": np.repeat([1, 2], T), "frame_idx": TWICE},
+    "BEDLAM": {"sub": ["1"] * T + ["2"] * T, "imgname": images(TWICE), "gender": ["male"] * T + ["female"] * T},
+    "one a folder": {"imgname": images(range(T), "1") + images(range(T), "2")},
+    "no number": {"track_ids": np.repeat([[1], [2]], T, axis=0)},
+}
+ORDERS = {
+    "grouped": np.arange(2 * T),
+    "interleaved": np.arange(2 * T).reshape(2, T).T.reshape(-1),
+    "any": np.random.default_rng(0).permutation(2 * T),
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("form", COLUMNS)
+@pytest.mark.parametrize("kind", ["npz", "torch", "pickle"])
+def test_rows_of_several_people_are_told_apart(kind: str, form: str, order: str, tmp_path: Path) -> None:
+    if form == "no number" and order == "any":
+        return
+    arrays = table(ORDERS[order], **COLUMNS[form])
+    path = tmp_path / ("a.npz" if kind == "npz" else "a.pt" if kind == "torch" else "a.pkl")
+    if kind == "npz":
+        np.savez(path, **arrays)
+    elif kind == "torch":
+        torch.save({name: array.tolist() if array.dtype.kind == "U" else torch.tensor(array) for name, array in
+                    arrays.items()}, path)  # fmt: skip
+    else:
+        path.write_bytes(pickle.dumps({"results": {**arrays, "fps": 30.0}}))
+    before = "results/" if kind == "pickle" and form in ("BEDLAM", "one a folder") else ""
+    first, second = (read_motion(path, fps=30, person=before + person) for person in ("1", "2"))
+    same(first)
+    np.testing.assert_allclose(first.transl, TRANSL, atol=1e-6)
+    np.testing.assert_allclose(second.transl, TRANSL + AWAY, atol=1e-6)
+    np.testing.assert_allclose(second.poses, POSES[::-1], atol=1e-6)
+    assert (first.betas[0], second.betas[0]) == (0.5, -0.5)
+    assert second.gender == ("female" if form == "BEDLAM" else "neutral")
+    said = "; ".join(read_motion(path, fps=30).notes)
+    assert "the rows are 2 persons', told apart by their" in said
+    assert f"2 persons: {before}" in said
+    assert not any(word in said for word in ("jumps", "m/s", "missing", "betas differ"))
+
+
+def test_rows_of_one_image_are_followed_by_their_places(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.npz", **table(ORDERS["interleaved"], imgname=images(TWICE)))
+    motion = read_motion(path)
+    same(motion)
+    assert "2 persons: 0 (30 frames), 1 (30 frames)" in "; ".join(motion.notes)
+
+
+def test_rows_that_nothing_tells_apart_are_said_to_jump(tmp_path: Path) -> None:
+    for order, said in (
+        ("interleaved", "jumps to and fro by 2.5 m"),
+        ("grouped", f"jumps by 2.7 m after frame {T - 1}"),
+    ):
+        notes = "; ".join(read_motion(save(tmp_path / "a.npz", **table(ORDERS[order]))).notes)
+        assert f"the person {said}: several people's rows?" in notes
+        assert "divide" not in notes
+
+
+def test_columns_that_tell_nobody_apart_change_nothing(tmp_path: Path) -> None:
+    """A number for each row, a count of frames, pictures, one person's images."""
+    wanted = read_motion(save(tmp_path / "a.npz", poses=POSES, trans=TRANSL))
+    for columns in (
+        {"id": np.arange(T)},
+        {"frames": T},
+        {"frames": np.zeros((T, 40, 30, 3), np.uint8)},
+        {"frames": np.array([object()] * T)},
+        {"sub": "rp_a", "imgname": images(range(5, 5 + T))},
+        {"sub": ["rp_a"] * T, "image_path": ["a.png"] * T},
+        {"track_id": np.arange(T + 1)},
+    ):
+        motion = read_motion(save(tmp_path / "a.npz", poses=POSES, trans=TRANSL, **columns))
+        assert motion.notes == wanted.notes
+        np.testing.assert_array_equal(motion.poses, wanted.poses)
+
+
+@pytest.mark.parametrize("name", ["frame_ids", "frame_idx", "frame", "frames", "imgname"])
+@pytest.mark.parametrize("above", [False, True])
+def test_lost_frames_by_any_name(name: str, above: bool, tmp_path: Path) -> None:
+    """TRAM's `frame`, CoMotion's `frame_idx`; PromptHMR's `frames`, which stand above the pose."""
+    kept = np.delete(np.arange(T), [10, 11])
+    numbers: Any = images(kept) if name == "imgname" else kept
+    body = {"pred_rotmat": R[kept], "pred_trans": TRANSL[kept, None]}
+    if above and name == "imgname":
+        return
+    content: dict[str, Any] = {name: numbers, "world": body} if above else {**body, name: numbers}
+    np.save(tmp_path / "a.npy", content)  # type: ignore[arg-type]
+    motion = read_motion(tmp_path / "a.npy", fps=30)
+    assert "2 of 30 frames are missing: interpolated" in motion.notes
+    np.testing.assert_allclose(motion.transl[kept], TRANSL[kept])
+
+
+def test_numbers_that_are_time_stamps_fill_nothing(tmp_path: Path) -> None:
+    motion = read_motion(save(tmp_path / "a.npz", poses=POSES, trans=TRANSL, frame_idx=33_000 * np.arange(T)))
+    assert len(motion) == T
+    assert "at most 3000 for 30 frames are read" in "; ".join(motion.notes)
+
+
+def test_many_tables_are_refused_in_time(tmp_path: Path) -> None:
+    one = {"poses": np.zeros((20_000, 72), np.float32), "id": np.arange(20_000) % 2}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps([dict(one) for _ in range(1000)]))
+    assert "tables of more than 300000 rows" in run_limited(lambda: read_motion(tmp_path / "a.pkl", fps=30)).error
+    inner: Any = {"smpl_poses": np.zeros((4, 72)), "id": [1, 1, 2, 2]}
+    for _ in range(4):
+        inner = {str(i): inner for i in range(300)}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(inner))
+    assert not run_limited(lambda: read_motion(tmp_path / "a.pkl", fps=30)).error  # one mapping, seen from many sides
 
 
 @settings(max_examples=40, deadline=None)
@@ -208,6 +336,45 @@ BIPED = (
 )
 BIPED += "R|Toe0 Neck L|Clavicle R|Clavicle Head Bip01|L|UpperArm Bip01|R|UpperArm Bip01|L|Forearm Bip01|R|Forearm "
 BIPED += "Bip01|L|Hand Bip01|R|Hand L|Finger R|Finger"
+
+SOMA = "Hips LeftLeg RightLeg Spine1 LeftShin RightShin Spine2 LeftFoot RightFoot Chest LeftToeBase RightToeBase Neck1 "
+SOMA += "LeftShoulder RightShoulder Head LeftArm RightArm LeftForeArm RightForeArm LeftHand RightHand LI RI"
+DEEPMOTION = "hips l_upleg r_upleg spine l_leg r_leg spine1 l_foot r_foot spine2 l_toebase r_toebase neck l_shoulder "
+DEEPMOTION += "r_shoulder head l_arm r_arm l_forearm r_forearm l_hand r_hand l_index r_index"
+DEEPMOTION = " ".join(f"{name}_JNT" for name in DEEPMOTION.split())
+THEIA = "pelvis l_thigh r_thigh abdomen l_shank r_shank torso l_foot r_foot torso2 l_toes r_toes neck l_shoulder "
+THEIA += "r_shoulder head l_uarm r_uarm l_larm r_larm l_hand r_hand l_thumb r_thumb"
+VRM = "C_Hips L_UpperLeg R_UpperLeg C_Spine L_LowerLeg R_LowerLeg C_Chest L_Foot R_Foot C_UpperChest L_ToeBase "
+VRM += "R_ToeBase C_Neck L_Shoulder R_Shoulder C_Head L_UpperArm R_UpperArm L_LowerArm R_LowerArm L_Hand R_Hand LI RI"
+VRM = " ".join(f"J_Bip_{name}" for name in VRM.split())
+MAYA = "Root_M Hip_L Hip_R Spine1_M Knee_L Knee_R Spine2_M Ankle_L Ankle_R Chest_M Toes_L Toes_R Neck_M Scapula_L "
+MAYA += "Scapula_R Head_M Shoulder_L Shoulder_R Elbow_L Elbow_R Wrist_L Wrist_R Thumb_L Thumb_R"
+AVERAGE = " ".join(f"m_avg_{name}" for name in SMPL.split())
+MAKEHUMAN = "root upperleg01.L upperleg01.R spine05 lowerleg01.L lowerleg01.R spine03 foot.L foot.R spine01 toe2-1.L "
+MAKEHUMAN += "toe2-1.R neck01 clavicle.L clavicle.R head upperarm01.L upperarm01.R lowerarm01.L lowerarm01.R wrist.L "
+MAKEHUMAN += "wrist.R finger.L finger.R"
+ICLONE = "Hip L_Thigh R_Thigh Waist L_Calf R_Calf Spine01 L_Foot R_Foot Spine02 L_ToeBase R_ToeBase NeckTwist01 "
+ICLONE += "L_Clavicle R_Clavicle Head L_Upperarm R_Upperarm L_Forearm R_Forearm L_Hand R_Hand L_Index R_Index"
+ICLONE = " ".join(f"CC_Base_{name}" for name in ICLONE.split())
+BY_NAME = {"SOMA": SOMA, "DeepMotion": DEEPMOTION, "Theia": THEIA, "VRM": VRM, "Maya": MAYA, "m_avg": AVERAGE}
+BY_NAME |= {"MakeHuman": MAKEHUMAN, "iClone": ICLONE, "biped": BIPED}
+
+
+@pytest.mark.parametrize("tool", BY_NAME)
+def test_all_points_of_a_skeleton_are_found(tool: str, tmp_path: Path) -> None:
+    (tmp_path / "a.bvh").write_text(bvh([name.replace("|", "_") for name in BY_NAME[tool].split()], 100.0, n=1)[0])
+    notes = "; ".join(read_motion(tmp_path / "a.bvh").notes)
+    assert "is fitted by the positions of 18" in notes  # all, and the top of the head
+    assert "not found" not in notes
+
+
+def test_points_of_a_skeleton_that_are_not_found_are_named(tmp_path: Path) -> None:
+    """Rigify's: a spine has no names; its root is known as the pelvis, since both legs hang on it."""
+    names = "spine thigh.L thigh.R spine.001 shin.L shin.R spine.002 foot.L foot.R spine.003 toe.L toe.R spine.004 "
+    names += "shoulder.L shoulder.R spine.006 upper_arm.L upper_arm.R forearm.L forearm.R hand.L hand.R index.L index.R"
+    (tmp_path / "a.bvh").write_text(bvh(names.split(), 100.0, n=1)[0])
+    notes = "; ".join(read_motion(tmp_path / "a.bvh").notes)
+    assert "by the positions of 15; not found by their names: neck, head" in notes
 
 
 @pytest.mark.parametrize("names", [SMPL, MOTIVE, KINECT, CMU, BIPED], ids=["SMPL", "Motive", "Kinect", "CMU", "biped"])

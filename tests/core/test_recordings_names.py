@@ -196,3 +196,89 @@ def test_roots_turn_about_the_pelvis_of_the_body_that_is_worn(tmp_path: Path) ->
 def test_a_rate_that_is_text(tmp_path: Path) -> None:
     np.savez(tmp_path / "a", poses=POSES, mocap_framerate="29.97")
     assert read_motion(tmp_path / "a.npz").fps == 29.97
+
+
+def test_one_frame_of_smplx_without_an_axis_of_time(tmp_path: Path) -> None:
+    """SMPLer-X: one file per person and image."""
+    np.savez(tmp_path / "a", global_orient=POSES[:1, 0], body_pose=POSES[0, 1:22], transl=TRANSL[0], betas=BETAS)
+    motion = read_motion(tmp_path / "a.npz", fps=30)
+    np.testing.assert_allclose(motion.transl[0] + PELVIS, TRANSL[0] + PELVIS_OF_SMPLX, atol=1e-6)
+    assert "betas are SMPL-X's" in "; ".join(motion.notes)
+
+
+def test_betas_of_smplx_on_a_body_of_smplx_are_its_own(tmp_path: Path) -> None:
+    wide = np.pad(POSES[:, :22].reshape(T, 66), ((0, 0), (0, 99)))
+    np.savez(tmp_path / "a", poses=wide, trans=TRANSL, betas=BETAS, fps=30)
+    male = Proportions.builtin("male")
+    own = read_motion(tmp_path / "a.npz", worn=Proportions(male.joints - [0, 0.13, 0], male.shapedirs))
+    assert "SMPL-X" not in "; ".join(own.notes)
+    assert "betas are SMPL-X's" in "; ".join(read_motion(tmp_path / "a.npz").notes)
+
+
+def test_rate_and_gender_that_stand_elsewhere(tmp_path: Path) -> None:
+    """MoSh's are among what it tells about its work."""
+    wide, told = np.pad(POSES[:, :22].reshape(T, 66), ((0, 0), (0, 99))), {"type": "smplx", "gender": "female"}
+    work: dict[str, Any] = {"mocap_frame_rate": 100.0, "cfg": {"surface_model": told}}
+    content: dict[str, Any] = {"fullpose": wide, "trans": TRANSL, "stageii_debug_details": work}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
+    motion = read_motion(tmp_path / "a.pkl")
+    assert (motion.fps, motion.gender) == (100, "female")
+    assert "mocap_frame_rate of stageii_debug_details counts for the motion" in motion.notes
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content | {"video": {"fps": 25.0}}))
+    with pytest.raises(MotionFileError, match="no frame rate in the file"):
+        read_motion(tmp_path / "a.pkl")
+    body = {"poses": POSES, "trans": TRANSL}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({"first": body | {"gender": "male"}, "second": dict(body), "fps": 9}))
+    assert read_motion(tmp_path / "a.pkl", person="second").gender == "neutral"
+
+
+@pytest.mark.parametrize("name", ["smpl_betas", "betas"])
+def test_a_child_is_not_left_out_in_silence(name: str, tmp_path: Path) -> None:
+    poses = "smpl_thetas" if name == "smpl_betas" else "poses"
+    for age in (0.0, 0.9):
+        np.savez(tmp_path / "a", **{poses: POSES.reshape(T, 72), name: np.tile([*BETAS, age], (T, 1)), "fps": 30})
+        motion = read_motion(tmp_path / "a.npz")
+        is_said = "the eleventh beta, a child's share of the shape (0.9), is left out" in "; ".join(motion.notes)
+        assert is_said == (name == "smpl_betas" and age > 0)
+        np.testing.assert_allclose(motion.betas, BETAS, atol=1e-6)
+
+
+def test_what_a_network_gave_is_not_another_person(tmp_path: Path) -> None:
+    def body(*axes: int) -> dict[str, Any]:
+        arrays = {"global_orient": POSES[:, 0], "body_pose": POSES[:, 1:22].reshape(T, 63), "transl": TRANSL}
+        return {name: array.reshape(*axes, *array.shape) for name, array in arrays.items()}
+
+    content = {"smpl_params_global": body(), "net_outputs": {"pred_smpl_params_global": body(1)}}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
+    motion = read_motion(tmp_path / "a.pkl", fps=30)
+    assert len(motion) == T
+    said = "; ".join(motion.notes)
+    assert "left out as another version of the same motion: net_outputs/pred_smpl_params_global" in said
+    assert "persons" not in said
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({"one": body(1), "two": body()}))
+    assert "2 persons: one (30 frames), two (30 frames)" in "; ".join(read_motion(tmp_path / "a.pkl", fps=30).notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "said"),
+    [
+        ("body_pose", (1, 32), "VPoser's latent pose: save what VPoser decodes it to"),
+        ("poses", (T, 33, 3), "keypoints: publish them, or use KeypointTracker"),
+        ("poses", (T, 17, 3), "keypoints: publish them, or use KeypointTracker"),
+        ("poses", (T, 75), "3 of a translation: save them apart, as poses and trans"),
+        ("poses", (T, 82), "10 of a shape: save them apart, as poses and betas"),
+        ("poses", (T, 85), "10 of a shape (VIBE): save the latter two apart, as poses and betas"),
+    ],
+)
+def test_arrays_that_hold_something_else_say_what_to_do(
+    name: str, shape: tuple[int, ...], said: str, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "a", **{name: np.full(shape, 0.1)}, fps=30)
+    with pytest.raises(MotionFileError) as told:
+        read_motion(tmp_path / "a.npz")
+    assert said in str(told.value)
+    if name == "poses":
+        np.save(tmp_path / "a", np.full(shape, 0.1))
+        with pytest.raises(MotionFileError) as told:
+            read_motion(tmp_path / "a.npy", fps=30)
+        assert said in str(told.value)
