@@ -131,7 +131,8 @@ def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any
         raise ValueError(msg)
     shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(head)
     if dtype.hasobject:
-        msg = "an array of objects, which would be a pickle, and isn't read"
+        msg = "an array of objects, which would be a pickle, and isn't read: save plain numbers, of a sparse matrix "
+        msg += "what its toarray() gives"
         raise ValueError(msg)
     wanted, there = dtype.itemsize * math.prod(shape), size - head.tell()
     if wanted != there or min(shape, default=0) < 0:

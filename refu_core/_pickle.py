@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import coo_array, csc_array, csr_array
 
 from refu_core._files import open_file
 from refu_core._npz import DAMAGE, ArrayBudget, told
 from refu_core._pickle_machine import (
     MAX_PICKLE_BYTES,
+    SPARSE,
     STREAM_MAGIC,
     Name,
     Record,
@@ -51,8 +52,8 @@ class PickledArrays:
         kind = value.kind if isinstance(value, Record) else ""
         if kind in ("array", "buffer"):
             return self._plain(value)
-        if kind == "sparse":
-            return self._sparse(exactly(dict, value.state))
+        if kind in SPARSE:
+            return self._sparse(kind, exactly(dict, value.state))
         if kind == "tensor":
             return self._tensor(value)
         if kind == "scalar":
@@ -60,8 +61,7 @@ class PickledArrays:
         if isinstance(value, (list, tuple)) and all(type(item) in (int, float) for item in value):
             self._budget.take((len(value),), np.dtype(np.float64))
             return np.asarray(value)
-        msg = f"{getattr(value, 'kind', type(value).__name__)} where an array was expected"
-        raise ValueError(msg)
+        raise ValueError(_unread(value))
 
     def _plain(self, record: Record) -> NDArray[Any]:
         if record.kind == "buffer":  # protocol 5
@@ -109,18 +109,41 @@ class PickledArrays:
         dense: NDArray[Any] = view.copy()
         return dense
 
-    def _sparse(self, state: dict[str, Any]) -> NDArray[Any]:
-        """A `scipy.sparse` matrix in compressed columns."""
+    def _sparse(self, kind: str, state: dict[str, Any]) -> NDArray[Any]:
+        """A `scipy.sparse` matrix: compressed columns, compressed rows, or coordinates."""
         rows, columns = (operator.index(n) for n in exactly(tuple, state["_shape" if "_shape" in state else "shape"]))
-        data, indices, pointers = (self.of(state[key]).reshape(-1) for key in ("data", "indices", "indptr"))
+        places = [state[key] for key in ("indices", "indptr")] if kind != "coo" else _coordinates(state)
+        data, first, second = (self.of(part).reshape(-1) for part in (state["data"], *places))
         self._budget.take((rows, columns), np.dtype(np.float64))
-        if not indices.dtype.kind == pointers.dtype.kind == "i":
-            msg = f"a sparse matrix with places of {indices.dtype} and {pointers.dtype}"
+        if not first.dtype.kind == second.dtype.kind == "i":
+            msg = f"a sparse matrix with places of {first.dtype} and {second.dtype}"
             raise ValueError(msg)
-        matrix = csc_array((data.astype(np.float64), indices, pointers), shape=(rows, columns))
+        numbers = data.astype(np.float64)
+        if kind == "coo":
+            if not len(numbers) == len(first) == len(second):
+                msg = f"a sparse matrix of {len(numbers)} numbers in {len(first)} rows and {len(second)} columns"
+                raise ValueError(msg)
+            listed: NDArray[Any] = coo_array((numbers, (first, second)), shape=(rows, columns)).toarray()
+            return listed
+        matrix = (csc_array if kind == "csc" else csr_array)((numbers, first, second), shape=(rows, columns))
         matrix.check_format(full_check=True)
         dense: NDArray[Any] = matrix.toarray()
         return dense
+
+
+def _coordinates(state: dict[str, Any]) -> list[Any]:
+    """Rows and columns of the entries of a sparse matrix; SciPy names them otherwise since its version 1.13."""
+    return [state["row"], state["col"]] if "row" in state else list(exactly(tuple, state["coords"]))
+
+
+def _unread(value: Any) -> str:
+    """What a value is that stands for no array, and what to do."""
+    kind = getattr(value, "kind", type(value).__name__)
+    if kind != "foreign":
+        return f"{kind} where an array was expected"
+    (name,) = (value.full,) if isinstance(value, Name) else value.args or ("an object",)
+    saved = "what its toarray() gives" if name.startswith("scipy.sparse") else "a plain NumPy array"
+    return f"it refers to {name}, which is not read (nothing was executed): save {saved}"
 
 
 def _streamed(record: Record) -> tuple[Record, Callable[[str], bytes]]:
@@ -139,11 +162,11 @@ def read_smpl_pickle(
     """The arrays of an official SMPL `.pkl` that are named in `keys`.
 
     Raises:
-        error: the file is too large, isn't a pickle, isn't a model, or refers to anything but arrays.
+        error: the file is too large, isn't a pickle, isn't a model, or holds anything but arrays under one of the keys.
     """
     with open_file(path, most=MAX_PICKLE_BYTES, error=error, wanted=wanted) as file:
         try:
-            content = Unpickler(file, is_model=True).load()
+            content = Unpickler(file).load()
         except DAMAGE as cause:
             msg = f"{path}: can't be read as an SMPL pickle: {told(cause)}; wanted {wanted}"
             raise error(msg) from cause

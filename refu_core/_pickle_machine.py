@@ -23,18 +23,21 @@ MAX_PICKLE_BYTES = 512 << 20
 """The largest official file has 236 MiB: it's text, and takes three times what its arrays do."""
 STREAM_MAGIC = 0x1950A86A20F9469CFC6C
 """A stream of torch begins with a pickle of this number alone."""
-_MODEL_READS, _DATA_READS = 200_000, 1_500_000
-"""The most reads of a model and of data. An opcode takes one to three; an official file has some hundred opcodes, a
-tracker's has a thousand a frame."""
+_MAX_READS = 1_500_000
+"""An opcode takes one to three reads; an official file has some hundred opcodes, a tracker's has a thousand a frame."""
 _MAX_MARKS = 10_000
 """The most values nested in each other; Python itself writes no more than a thousand."""
 _MAX_NAMES = 10_000
 """Python writes each name once in a file, and then refers to it."""
+_LONGEST_NAME = 80
+"""Of a longer name only this much is kept, for messages."""
 _MAX_NESTED = 4
 """The most pickles nested in each other: joblib writes arrays of objects that way."""
 _LONG_TEXT = 1 << 16
 _NUMPY = ("numpy.core", "numpy._core")
-MODEL_NAMES: dict[str, str] = {
+SPARSE = ("csc", "csr", "coo")
+"""The kinds of `scipy.sparse` matrices that are read."""
+NAMES: dict[str, str] = {
     "numpy.dtype": "dtype",
     "numpy.ndarray": "array",
     "_codecs.encode": "bytes",
@@ -43,11 +46,13 @@ MODEL_NAMES: dict[str, str] = {
     **{f"{module}._reconstructor": "new" for module in ("copy_reg", "copyreg")},
     **{f"{module}.object": "object" for module in ("__builtin__", "builtins")},
     **{f"{module}.bytearray": "bytes" for module in ("__builtin__", "builtins")},
-    **{f"{module}.csc_matrix": "sparse" for module in ("scipy.sparse.csc", "scipy.sparse._csc", "scipy.sparse")},
+    **{
+        f"scipy.sparse{module}.{kind}_{name}": kind
+        for kind in SPARSE
+        for module in (f".{kind}", f"._{kind}", "")
+        for name in ("matrix", "array")
+    },
     **{f"chumpy.{name}": "chumpy" for name in ("ch.Ch", "ch.MatVecMult", "reordering.Select")},
-}
-"""The names that a model may contain, and the kind of record that each becomes here."""
-_DATA_NAMES: dict[str, str] = MODEL_NAMES | {
     **{f"{package}.multiarray.scalar": "scalar" for package in _NUMPY},
     **{f"collections.{name}": "mapping" for name in ("OrderedDict", "defaultdict")},
     "joblib.numpy_pickle.NumpyArrayWrapper": "joblib",
@@ -62,14 +67,16 @@ _DATA_NAMES: dict[str, str] = MODEL_NAMES | {
         )
     },
 }
-"""The names that a file of data may use; every other name in it is kept, but inert (`foreign`)."""
+"""The names that are known, and the kind of record that each becomes; all others are kept, but inert (`foreign`)."""
 
 
 @dataclass(eq=False, slots=True)
 class Name:
-    """A name, by its kind in the tables above, or `foreign`."""
+    """A name, and its kind in the table above, or `foreign`."""
 
     kind: str
+    full: str
+    """With its module."""
 
 
 @dataclass(eq=False, slots=True)
@@ -78,6 +85,7 @@ class Record:
 
     kind: str
     args: tuple[Any, ...] = ()
+    """Of a `foreign` one, the name alone."""
     state: Any = None
     items: dict[str | int, Any] = field(default_factory=dict)
     """What was put into it, if it stands for a subclass of dictionary."""
@@ -101,10 +109,7 @@ class _Opcodes(dict[int, Any]):
 
 
 class Unpickler(pickle._Unpickler):
-    """In a model it accepts only the names that a model needs; in data it accepts any, and foreign objects stay inert.
-
-    `load` raises one of `DAMAGE` where the file is damaged.
-    """
+    """Keeps objects of unknown names, but inert. `load` raises one of `DAMAGE` where the file is damaged."""
 
     stack: list[Any]
     metastack: list[list[Any]]
@@ -113,10 +118,9 @@ class Unpickler(pickle._Unpickler):
     read: Callable[[int], bytes]
     readline: Callable[[], bytes]
 
-    def __init__(self, file: BinaryIO | Unpickler, *, is_model: bool = False, nested: int = 0) -> None:
+    def __init__(self, file: BinaryIO | Unpickler, *, nested: int = 0) -> None:
         super().__init__(file, encoding="latin1")
-        self._is_model, self._nested = is_model, nested
-        self._left, self._n_names = _MODEL_READS if is_model else _DATA_READS, 0
+        self._nested, self._left, self._n_names = nested, _MAX_READS, 0
         self._read_uncounted, self._file_read = file.read, self._read_counted
         self.storages: dict[str, np.dtype[Any]] = {}
         """The types of torch's storages beside the pickle, by their keys."""
@@ -135,10 +139,7 @@ class Unpickler(pickle._Unpickler):
             msg = f"it names objects more than {_MAX_NAMES} times"
             raise ValueError(msg)
         full = f"{module}.{name}"
-        if self._is_model and full not in MODEL_NAMES:
-            msg = f"it refers to {full[:80]}, which no SMPL model needs: refused, nothing was executed"
-            raise ValueError(msg)
-        return Name(_DATA_NAMES.get(full, "foreign"))
+        return Name(NAMES.get(full, "foreign"), full[:_LONGEST_NAME])
 
     def persistent_load(self, pid: Any) -> Record:
         """A stand-in for a storage of torch, which is beside the pickle."""
@@ -295,8 +296,10 @@ def is_plain(code: Any) -> bool:
 def _made(called: Any, args: tuple[Any, ...]) -> Any:
     """The result of calling a name."""
     if type(called) is Record:  # the result of a foreign call
-        return Record("foreign")
+        return Record("foreign", called.args if called.kind == "foreign" else ())
     kind = exactly(Name, called).kind
+    if kind == "foreign":
+        return Record(kind, (called.full,))
     if kind == "new":  # Python 2's way to make an object; its class is the first argument
         kind, args = exactly(Name, args[0]).kind, ()
     if kind == "mapping":

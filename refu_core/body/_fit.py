@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from refu_core._cache import keep, recall
 from refu_core.body._io import load_body
 from refu_core.body._model import BodyArrays, SmplBody
-from refu_core.body._register import ENDS, Registration, derivatives, register
+from refu_core.body._register import ENDS, Registration, derivatives, register, size_of
 from refu_core.body._rest_pose import require_rest_pose
 from refu_core.body._surface import OnSurface
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -29,10 +30,11 @@ if TYPE_CHECKING:
 REGISTERED = "neutral"
 """The built-in body that is laid onto others: it is half way between the other two."""
 POOR_FIT = 3e-3
-"""Surfaces farther apart than this on average [m] don't belong to two bodies in the T-pose. (Those in
-tests/smpl_file.py are .3 to .5 mm apart.)"""
-_USUAL = (1.2, 2.3)
-"""Heights at which garments look as on the built-in bodies [m]. At 1.3 m they do; at 0.9 m a collar is off the neck."""
+"""Surfaces farther apart than this on average [m], at an adult's height, don't belong to two bodies in the T-pose.
+(Those in tests/smpl_file.py are .3 to .5 mm apart.)"""
+_POOR_FAR = 10e-3
+"""The same at the 99th percentile [m]. (Those are 1.6 to 2.3 mm apart, an infant with its large head 4 mm; where limbs
+aren't found, it is 15 mm and more.)"""
 _ANGLE_SPREAD = 0.1
 """How much a joint's angle differs between two rest poses [rad]."""
 _TRUST = 1e-3
@@ -41,7 +43,7 @@ _END_SHARE = 0.1
 """How much hands, feet and heads count when shapes are compared."""
 _REGRESSED = 400
 """Number of vertices that a joint is regressed from."""
-_VERSION = 1
+_VERSION = 2
 """Version of what `register` computes: results that another version has cached aren't used."""
 
 
@@ -63,7 +65,10 @@ class ShapeMap:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """What a built-in body's shape space can't express of another body, at the V vertices of the built-in mesh."""
+    """What a built-in body's shape space can't express of another body, at the V vertices of the built-in mesh.
+
+    Lengths are those of the other body at an adult's height (`BodyFit.size`).
+    """
 
     source: SmplBody
     """The built-in body, float64, on the CPU."""
@@ -87,10 +92,16 @@ class BodyFit:
         """Fingerprints of bodies: weights trained on any of them are this body's own."""
         self._of: dict[str, Difference] = {}
 
+    @cached_property
+    def size(self) -> float:
+        """How many times as large as an adult the body is; 1 from 1.5 to 2 m."""
+        return size_of(self.body)
+
     @property
     def is_poor(self) -> bool:
-        """Whether the surfaces are too far apart to trust what is transferred."""
-        return self.registration.mean_distance > POOR_FIT
+        """Whether the surfaces are too far apart, for the body's size, to trust what is transferred."""
+        found = self.registration
+        return found.mean_distance > POOR_FIT * self.size or found.far_distance > _POOR_FAR * self.size
 
     @property
     def text(self) -> str:
@@ -103,14 +114,10 @@ class BodyFit:
     @property
     def warnings(self) -> list[str]:
         """Warnings about the fit, in words."""
-        found, tall = [], float(np.ptp(self.body.arrays.v_template[:, 1]))
-        if self.is_poor:
-            wanted = f"wanted {1e3 * POOR_FIT:g} mm at most"
-            found += [f"the built-in mesh lies on {self.body.name} {self.text}, {wanted}: garments may fit it badly"]
-        if not _USUAL[0] <= tall <= _USUAL[1]:
-            wanted = f"garments are cut with the room and the folds of people of {_USUAL[0]:g} to {_USUAL[1]:g} m"
-            found += [f"{self.body.name} is {tall:.2f} m tall, and {wanted}: they stand off it, or are tight"]
-        return found
+        if not self.is_poor:
+            return []
+        wanted = f"wanted {1e3 * POOR_FIT * self.size:.2g} mm at most, and {1e3 * _POOR_FAR * self.size:.2g} mm"
+        return [f"the built-in mesh lies on {self.body.name} {self.text}, {wanted}: garments may fit it badly"]
 
     def carried(self, values: NDArray[np.floating]) -> Array:
         """`values` of the body's vertices (N, …), interpolated at the vertices of the built-in mesh (V, …)."""
@@ -132,7 +139,8 @@ class BodyFit:
     def _differ(self, source: SmplBody) -> Difference:
         rest, own = source.v_template.numpy(), source.arrays.shapedirs
         columns = derivatives(source.name).vertices
-        goal = np.concatenate(((self.registration.vertices - rest)[:, :, None], self.directions()), axis=2)
+        off = self.registration.vertices / self.size - rest
+        goal = np.concatenate((off[:, :, None], self.directions() / self.size), axis=2)
         columns = columns.reshape(-1, columns.shape[2])
         share = np.where(source.weights[:, list(ENDS)].sum(1).numpy() > 0.5, _END_SHARE, 1.0)
         weight = np.repeat(share / share.sum(), 3)[:, None]

@@ -18,8 +18,8 @@ from refu_core.errors import BodyError, require_type
 from refu_core.modes import BUILTIN_BODIES
 
 _KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs", "posedirs")
-_MISNAMED = ("faces",)
-"""Read only so that an error can say what the key should be called."""
+_TELLING = ("faces", "skin_template_v")
+"""Read only so that an error can say what the key should be called, or what the file is."""
 _MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".fbx")
 _WANTED = "a body model, an .npz or an official .pkl file"
 
@@ -56,7 +56,7 @@ def load_body(
             msg += ": a mesh or a scan has no joints and no shapes; fit SMPL to it and give SMPL's own file"
         raise BodyError(msg)
     read = read_npz if path.suffix.lower() == ".npz" else read_smpl_pickle
-    data = read(path, keys=_KEYS + _MISNAMED, error=BodyError, wanted=_WANTED)
+    data = read(path, keys=_KEYS + _TELLING, error=BodyError, wanted=_WANTED)
     return SmplBody(BodyArrays.from_mapping(data, source=str(path)), name=path.stem, device=device, dtype=dtype)
 
 

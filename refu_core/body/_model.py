@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from refu_core.body._fingers import without_fingers
+from refu_core.body._hints import n_rows, of_keys, of_shape, of_tree
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
 from refu_core.errors import BodyError, FrameError, require_type
@@ -70,11 +71,7 @@ class BodyArrays:
         """Reads the keys of SMPL files (`f`, `J_regressor`, `kintree_table`, …); raises `BodyError`."""
         missing = sorted({"v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs"} - set(data))
         if missing:
-            msg = f"{source}: not an SMPL-layout model, it lacks {', '.join(missing)}"
-            if missing == ["f"] and "faces" in data:
-                msg += ": SMPL's files call their faces f"
-            elif "weights" in missing and "shapedirs" in missing:
-                msg += ": a mesh or a scan has no joints and no shapes; fit SMPL to it and give SMPL's own file"
+            msg = f"{source}: not an SMPL-layout model, it lacks {', '.join(missing)}{of_keys(data, missing)}"
             raise BodyError(msg)
 
         def numbers(key: str) -> NDArray[np.float64]:
@@ -93,39 +90,40 @@ class BodyArrays:
         read = {key: numbers(key) for key in ("weights", "J_regressor", "kintree_table", "posedirs") if key in data}
         read = without_fingers(read)
         v_template = numbers("v_template")
-        n = len(v_template) if v_template.ndim == 2 else 0
+        n = n_rows(v_template.shape) if v_template.ndim == 2 else 0
         parents = read["kintree_table"]
         # The root's parent is stored as 2**32 - 1 or -1.
         if parents.shape != (2, N_JOINTS) or tuple(parents[0, 1:].tolist()) != PARENTS[1:]:
             msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, or of SMPL-H's or SMPL-X's, "
-            msg += f"got the shape {parents.shape}"
+            msg += f"got the shape {parents.shape}{of_tree(parents.shape)}"
             raise BodyError(msg)
-        posedirs = read.get("posedirs")
-        shapedirs = numbers("shapedirs")
-        if shapedirs.ndim != 3 or shapedirs.shape[2] < N_BETAS:
+
+        def require(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+            if array.shape != shape or not n:
+                msg = f"{source}: {name} must have the shape {shape}, got {array.shape}{of_shape(array.shape, shape)}"
+                raise BodyError(msg)
+
+        require("v_template", v_template, (n, 3))
+        shapedirs, faces = numbers("shapedirs"), np.atleast_1d(numbers("f"))
+        n_shapes = shapedirs.shape[0 if shapedirs.shape[-1] in (n, 3 * n) else -1] if shapedirs.ndim else 0
+        if n_shapes < N_BETAS:
             msg = f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}"
             raise BodyError(msg)
+        require("shapedirs", shapedirs, (n, 3, n_shapes))
+        require("f", faces, (n_rows(faces.shape), 3))
+        require("weights", read["weights"], (n, N_JOINTS))
+        require("J_regressor", read["J_regressor"], (N_JOINTS, n))
+        posedirs = read["posedirs"] if "posedirs" in read and read["posedirs"].any() else None
+        if posedirs is not None:
+            require("posedirs", posedirs, (n, 3, N_POSE_FEATURES))
         arrays = cls(
             v_template=v_template,
-            faces=np.atleast_1d(numbers("f")).astype(np.int64),
+            faces=faces.astype(np.int64),
             weights=read["weights"],
             joint_regressor=read["J_regressor"],
             shapedirs=shapedirs[:, :, :N_BETAS],
-            posedirs=posedirs if posedirs is not None and posedirs.any() else None,
+            posedirs=posedirs,
         )
-        wanted = {
-            "v_template": (n, 3),
-            "faces": (len(arrays.faces), 3),
-            "weights": (n, N_JOINTS),
-            "joint_regressor": (N_JOINTS, n),
-            "shapedirs": (n, 3, N_BETAS),
-        }
-        if arrays.posedirs is not None:
-            wanted["posedirs"] = (n, 3, N_POSE_FEATURES)
-        for name, shape in wanted.items():
-            if getattr(arrays, name).shape != shape or not n:
-                msg = f"{source}: {name} must have the shape {shape}, got {getattr(arrays, name).shape}"
-                raise BodyError(msg)
         if arrays.faces.min(initial=0) < 0 or arrays.faces.max(initial=0) >= n:
             msg = f"{source}: faces must index {n} vertices, got {arrays.faces.min()} to {arrays.faces.max()}"
             if (arrays.faces.min(), arrays.faces.max()) == (1, n):

@@ -27,7 +27,7 @@ Half of what changes within 7 edges, 7 cm of a T-shirt, is levelled out."""
 _HELD_WITHIN = 0.03
 """Cloth farther off the skin than this mostly follows its own neighbours [m]: between two legs it follows neither."""
 _CLEARANCE = 0.006
-"""How far off their body garments are cut [m]: no more is required on another body."""
+"""How far off their body garments are cut [m]: no more is required on another body, whatever its size."""
 _FROM_MIDDLE = 0.003
 """How far vertices stay from the plane between left and right, if they are cut that far from it [m]."""
 _LIFTS = 6
@@ -45,23 +45,24 @@ def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
 
     The garment already follows whatever is in the shape space of the body that it was cut for. What else is different
     about the new body is carried over from the skin below the garment. So nothing changes on the garment's own body.
+    A child's garment is carried over to the child at an adult's height, and then made as small as the child.
     """
     if fit is None or fit.body.fingerprint == load_body(garment.body).fingerprint:
         return garment
     differs = fit.difference(garment.body)
     exact = garment.to(device="cpu", dtype=torch.float64)
-    source, betas = differs.source, differs.betas
+    source, betas, size = differs.source, differs.betas, fit.size
     with torch.no_grad():
         rest = exact.rest(betas.offset[None])[0].numpy()
         skin = source.rest_vertices(betas.offset[None])[0].numpy()
     carry = _Carrier(rest, garment, skin)
     own = exact.shapedirs.numpy() @ betas.matrix.numpy()
     n = garment.n_vertices
-    directions = own.reshape(n, 3, N_BETAS) + carry(differs.directions)
-    vertices = rest + carry(differs.template)
+    directions = size * (own.reshape(n, 3, N_BETAS) + carry(differs.directions))
+    vertices = size * (rest + carry(differs.template))
     clear = np.minimum(Surface(skin, source.arrays.faces.astype(np.int32)).heights(rest)[0], _CLEARANCE)
     own_side = exact.v_template[:, 0].numpy()
-    middle = float((fit.body.joint_template - load_body(garment.body).joint_template)[:, 0].mean())
+    middle = float((fit.body.joint_template - size * load_body(garment.body).joint_template)[:, 0].mean())
     vertices = _on_own_side(_lifted(_on_own_side(vertices, own_side, middle), clear, garment, fit), own_side, middle)
     weights = (exact.weights.numpy() + carry(differs.weights)).clip(0)
     few = np.sort(weights, axis=1)[:, -_INFLUENCES, None]
@@ -72,6 +73,7 @@ def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
         v_template=torch.as_tensor(vertices).to(garment.v_template),
         shapedirs=torch.as_tensor(directions.reshape(3 * n, N_BETAS)).to(garment.shapedirs),
         weights=torch.as_tensor(weights).to(garment.weights),
+        styledirs=None if garment.styledirs is None else size * garment.styledirs,
     )
 
 

@@ -101,7 +101,7 @@ def _drape(
     predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code, **told)
     unposed, on_mean = garment.rest, garment.on_mean
     if predicted is not None:
-        displacement = predicted.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
+        displacement = wearable.size * predicted.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
         unposed, on_mean = unposed + displacement, on_mean + displacement
     z = None
     if wearable.refu is not None:

@@ -97,13 +97,14 @@ def wearable_of(
     """
     worn = worn_on(template, fit)
     trained_on, source = stored.card.get("body_fingerprint"), load_body(template.body).fingerprint
-    betas = None
+    betas, size = None, 1.0
     if fit is not None and trained_on in fit.fingerprints:
         network, refu = trained_from_weights(stored, worn, device=device)
     elif trained_on == source:
         # Networks know the garment on the body that they were trained on.
         network, refu = trained_from_weights(stored, template, device=device)
-        betas = None if worn is template or fit is None else fit.difference(template.body).betas
+        if worn is not template and fit is not None:
+            betas, size = fit.difference(template.body).betas, fit.size
     else:
         own = "" if fit is None else f"{fit.body.name} ({fit.body.fingerprint}) or "
         hint = "name that body's file as the body, or " if fit is None else ""
@@ -114,4 +115,4 @@ def wearable_of(
         raise WeightsError(msg)
     margin = DEFAULT_MARGIN if refu is None else refu.margin
     feels_arms = all(joint in template.card.joints for arm in ARMS for joint in arm[:2])  # shoulders and elbows
-    return Wearable(worn, network, refu, margin, betas, feels_arms and stored.card.get("knows_limbs") is True)
+    return Wearable(worn, network, refu, margin, betas, size, feels_arms and stored.card.get("knows_limbs") is True)

@@ -31,6 +31,8 @@ class Wearable:
     """ε that the networks were trained with [m]."""
     betas: ShapeMap | None = None
     """Maps the body's betas to those of the body that the networks were trained on; None if that is the same body."""
+    size: float = 1.0
+    """How many times as large as the latter the body is: networks know the folds of adults."""
     knows_arms: bool = False
     """Whether the networks have learnt where cloth lies beside arms: they are told where the arms are, and in their
     samples arms were where people have them."""
@@ -51,6 +53,9 @@ class Outfit:
     """Makes the body that garments are brought off; None for the posed body as it is, which may run through itself."""
     fit: BodyFit | None = None
     """How a body that isn't the garments' own relates to the built-in ones."""
+
+    def __repr__(self) -> str:
+        return f"Outfit({', '.join(self.wearables)} on {self.body.name})"
 
     @cached_property
     def below(self) -> Mapping[str, SkinBelow]:

@@ -18,7 +18,7 @@ import pytest
 
 from msg_adapters import read_motion
 from refu_core import load_body
-from refu_core._pickle_machine import MODEL_NAMES
+from refu_core._pickle_machine import NAMES
 from tests.core.test_body import random_model
 from tests.core.test_files import SPECIAL
 from tests.limits import refusal, run_limited, said
@@ -124,7 +124,7 @@ def test_every_opcode_alone_and_every_name_built_in_every_way(tmp_path: Path) ->
                 content = b"}U\x01f((N)]}" + opcode.code.encode("latin1") + rest + b"s."
                 with pytest.raises(ValueError, match=r"model\.pkl"):
                     load_body(pkl(tmp_path, content))
-        for name in MODEL_NAMES:
+        for name in NAMES:
             module, _, last = name.rpartition(".")
             for use in (b"(tR", b"N\x85R", b")\x81", b"(N}tR}U\x05stateNsb", b"U\x01aNN\x87R(NNNNNtb"):
                 content = b"}U\x01fc" + f"{module}\n{last}\n".encode() + use + b"s."

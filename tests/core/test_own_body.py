@@ -337,14 +337,6 @@ def test_how_arrays_lie_in_memory_plays_no_role() -> None:
     GarmentPipeline.load(["short-pant-male"], body=body, backbone="skinned")(SmplFrame(pose=np.zeros((24, 3))))
 
 
-def test_a_small_child_is_dressed_with_a_warning() -> None:
-    arrays = _turned(dict(smpl_arrays("female")), 0.55 * np.eye(3))
-    child = SmplBody(type(load_body("male").arrays).from_mapping(arrays, source="child"), name="child")
-    (warning,) = load_fit(child).warnings
-    assert "child is 0.9" in warning
-    assert "they stand off it" in warning
-
-
 def test_a_body_may_stand_beside_its_origin() -> None:
     """On legs of either side of x = 0, which then isn't its middle."""
     worn = []

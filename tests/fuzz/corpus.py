@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from mcap.writer import CompressionType, Writer
+from scipy.sparse import coo_array, csr_array, lil_array
 
 import msg_adapters as adapters
 from refu_core import SmplFrame, load_body, load_garment
@@ -222,6 +223,9 @@ def body_pickles() -> list[bytes]:
     """Bodies as pickles of every protocol, as the official files are, and with each gadget at the end."""
     found = [*(pickle.dumps(body_arrays(6), protocol) for protocol in range(6)), _chumpy_pickle()]
     found += [found[2][:-1] + gadget + b"." for gadget in GADGETS]
+    body = body_arrays(6)
+    for kept in (csr_array, coo_array, lil_array, torch.as_tensor):
+        found.append(pickle.dumps(body | {"J_regressor": kept(body["J_regressor"])}, 2))
     return [*found, b"(dS'f'\ncchumpy.ch\nCh\n)\x81q\x01}S'x'\nh\x01sbs."]  # a variable that is its own value
 
 

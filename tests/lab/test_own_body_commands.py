@@ -146,8 +146,8 @@ def test_info_says_how_garments_will_fit(body: Path, tmp_path: Path, capsys: pyt
     small = {key: 0.5 * known[key] for key in ("v_template", "shapedirs", "posedirs")}
     np.savez(tmp_path / "child.npz", **{**known, **small})
     out = run(capsys, "info", "--body", tmp_path / "child.npz")
-    assert "warnings  child is 0.8" in out
-    assert "they stand off it, or are tight" in out
+    assert "built-in mesh on it  0.2 mm on average" in out
+    assert "warnings" not in out
 
 
 def test_out_body_and_garments_are_at_one_place_with_transl(body: Path) -> None:
