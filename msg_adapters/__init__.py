@@ -45,6 +45,8 @@ from msg_adapters.markers import MarkerMesh as MarkerMesh
 from msg_adapters.markers import decode_marker_array as decode_marker_array
 from msg_adapters.markers import garment_namespace as garment_namespace
 from msg_adapters.markers import vertices_from_points as vertices_from_points
+from msg_adapters.message_filter import Held as Held
+from msg_adapters.message_filter import MessageFilter as MessageFilter
 from msg_adapters.motion import Motion as Motion
 from msg_adapters.motion import load_motion as load_motion
 from msg_adapters.motion import read_motion as read_motion

@@ -11,6 +11,8 @@ import numpy as np
 
 from refu_core.errors import printable
 
+COARSE_M = 8192.0
+"""From so far on, float32 has coordinates to a millimetre at best: points and polygons are of it [m]."""
 _WINDOW = 1000
 """How many of the newest latencies the percentiles are taken of."""
 
@@ -47,7 +49,8 @@ class Statistics:
 
     Keys: received, ticks, frames, drop.<cause>, skip.<kind> (work that nobody needed), fault.<where>,
     penetration.<found|unresolved>, back_in_time (a frame older than its person's previous one), late_transform (a frame
-    placed by a transform older than itself), beyond_promise (a frame that "nothing inside" isn't promised for).
+    placed by a transform older than itself), coarse (a frame `COARSE_M` or farther away), beyond_promise (a frame that
+    "nothing inside" isn't promised for).
     """
 
     def __init__(self) -> None:

@@ -20,6 +20,12 @@ _CLOSEST_NS = 1_000_000_000 // 240
 """Frames closer together in time than this replace one another, so that no frame rate fills the memory."""
 _FASTEST = 15.0
 """Anybody who moves faster is somebody else, or was lost and found again [m/s]; sprinters reach 12."""
+_FASTEST_TURN = 12.0
+"""Anybody whose root turns faster was taken for somebody else, or for facing backwards [rad/s].
+
+In ten recorded clips (jumps, swordplay, climbing) roots reach 6.2 over `_SHORTEST`; two turns a second are a dancer's.
+Half a turn from one frame to the next is faster at any rate from 4 Hz on.
+"""
 _SHORTEST = 1 / 30
 """Speeds are taken over at least this long [s]: queued messages are stamped on arrival, one right after another."""
 _LONGEST_PAUSE = 0.25
@@ -41,8 +47,9 @@ class PoseHistory:
     """Adds to frames the half second before them, as `SmplFrame.past`, for pipelines with the backbone `dynamic`.
 
     Only the frames of that half second are kept, so nothing can drift. People are taken to have stood still before
-    their first frame, and after a pause of over a quarter of a second, a clock that went back, or a leap. Frames may
-    come at any rate from 4 Hz on, and twice: of two with the same stamp the later counts. Not thread-safe.
+    their first frame, and after a pause of over a quarter of a second, a clock that went back, or a leap, of place or
+    direction. Frames may come at any rate from 4 Hz on, and twice: of two with the same stamp the later counts. Not
+    thread-safe.
 
     `past` is the state `LAGS` ago minus the state now, shape (4, 219): nine numbers of each joint's rotation relative
     to its parent, row by row, those of the root in its own axes; then where the root was [m], in its axes, relative to
@@ -91,8 +98,11 @@ class PoseHistory:
 def _goes_on(last: _Moment, now: _Moment) -> bool:
     """Whether `now` continues the motion of `last`."""
     passed = now.stamp_ns - last.stamp_ns
+    seconds = max(1e-9 * passed, _SHORTEST)
     way = float(np.linalg.norm(now.transl - last.transl))
-    return -_CLOSEST_NS < passed <= 1e9 * _LONGEST_PAUSE and way <= _FASTEST * max(1e-9 * passed, _SHORTEST)
+    turn = float(Rotation.from_matrix(last.rotations[0].T @ now.rotations[0]).magnitude())
+    is_soon = -_CLOSEST_NS < passed <= 1e9 * _LONGEST_PAUSE
+    return is_soon and way <= _FASTEST * seconds and turn <= _FASTEST_TURN * seconds
 
 
 def _past(moments: Sequence[_Moment]) -> NDArray[np.float32]:

@@ -39,7 +39,7 @@ class BagJob:
         self.output = output
         self._folder = tempfile.TemporaryDirectory(prefix="refu-replay-")
         self._result = Path(self._folder.name, "result.json")
-        command = [sys.executable, "-m", "refu_lab.cli", "replay", str(bag), f"--output={output}", "--progress=lines"]
+        command = [sys.executable, "-m", "refu_lab", "replay", str(bag), f"--output={output}", "--progress=lines"]
         given = ["betas_source", *["betas"] * bool(settings.known_betas), *["style"] * any(settings.style)]
         if bag.suffix.lower() not in SUFFIXES:  # a file of motion says itself how it is to be read
             given += ["input_axes", *["input_type", "keypoints"] * (settings.input_type in KEYPOINT_TYPES)]

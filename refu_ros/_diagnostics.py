@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from msg_adapters import DiagnosticStatus
 from msg_adapters.bags import RecorderState
 from msg_adapters.diagnostics import ERROR, OK, WARN
-from msg_adapters.statistics import Report
+from msg_adapters.statistics import COARSE_M, Report
 from refu_core.modes import FOREIGN_BETAS
 from refu_core.options import PipelineOptions
 from refu_ros._settings import NodeSettings
@@ -40,8 +40,8 @@ class Situation:
     """The options of the pipeline in use."""
     input_frame: str = ""
     """The sender's frame, where it isn't the markers'."""
-    is_transformed: bool = False
-    """Whether anybody sends transforms."""
+    is_untransformed: bool = False
+    """Whether the input is shown as if its frame were that of the markers: there is no tf2_msgs."""
     has_foreign_betas: bool = False
     """Whether betas have come without anything saying whose shape space they belong to."""
     doubted: str = ""
@@ -107,9 +107,17 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
     if missing and silent_for is not None and waited > _FIRST_INPUT_S:
         nobody = received and not persons
         rules.append((True, WARN, f"nobody is here, though {received} messages came" if nobody else silence))
-    rules += [(now.doubted, WARN, now.doubted), (now.has_foreign_betas, WARN, FOREIGN_BETAS)]
+    if now.is_untransformed and now.input_frame:
+        frames = f"{now.input_frame} is taken for {settings.frame_id}"
+        rules.append((True, WARN, f"{frames}: install tf2_msgs, or set frame_id if they are the same place"))
+    late = f"{recent['late_transform']} frames are placed by older transforms: newer ones came too late, or never"
+    rules += [
+        (recent["late_transform"], WARN, late),
+        (now.doubted, WARN, now.doubted),
+        (now.has_foreign_betas, WARN, FOREIGN_BETAS),
+    ]
     rules += [(True, OK, f"{report.rate('received'):.1f} Hz")]
-    way = "transformed to" if now.is_transformed else "shown as"
+    way = "shown as" if now.is_untransformed else "transformed to"
     values = {
         "subscribed": "no" if now.listening_for is None else "yes",
         "rate [Hz]": f"{report.rate('received'):.1f}",
@@ -136,13 +144,14 @@ def _output(report: Report, settings: NodeSettings, now: Situation) -> Judgement
         (
             now.n_namesakes,
             WARN,
-            f"{now.n_namesakes + 1} nodes have this name: start others with -r __node:=another_name",
+            f"{now.n_namesakes + 1} nodes have this name: start others with -r __ns:=/another_namespace",
         ),
         (
             stale > _OVER_BUDGET * received,
             WARN,
             f"over budget: {stale} of {received} frames were superseded; latency p95 {p95:.1f} ms",
         ),
+        (recent["coarse"], WARN, f"people are over {COARSE_M:g} m away, and points are float32: use a local frame_id"),
         (now.listening_for is None, OK, "nobody listens"),
         (True, OK, f"{report.rate('ticks'):.1f} Hz, latency p95 {p95:.1f} ms"),
     ]

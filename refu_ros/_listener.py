@@ -24,9 +24,8 @@ from refu_ros._interfaces import interface, ros_qos
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from msg_adapters import Placement
     from msg_adapters.scene import Scene
-    from refu_core import SmplBody
+    from refu_core import SmplBody, SmplFrame
     from refu_core.outputs import PinholeCamera
     from refu_ros._node import GarmentNode
     from refu_ros._settings import NodeSettings
@@ -37,14 +36,14 @@ _TRACKED = "/humans/bodies/tracked"
 _GRACE_S = 5.0
 """How long the inputs stay subscribed to after the last viewer has left: many viewers are only restarted [s]."""
 _TF_DEPTH = 100
-_FIRST_TF_S = 1.0
-"""How long the first transform is waited for; then people are shown as if their frame were that of the messages [s]."""
+_RETRY_S = 0.02
+"""How often it is looked whose wait for a transform is over, when neither inputs nor transforms come [s]."""
 
 
 class Listener:
-    """Subscribes to the inputs and fills the scene, on the executor's thread; its counters are thread-safe."""
+    """Subscribes to the inputs and fills the scene, on the executor's thread; `clock` is a steady one."""
 
-    def __init__(self, node: GarmentNode) -> None:
+    def __init__(self, node: GarmentNode, clock: Any) -> None:
         self._node = node
         self.stream, self.doubts = adapters.InputStream(node.settings.input_type), adapters.Doubts()
         self.room = max(MOST_PEOPLE, len(node.settings.persons))
@@ -59,9 +58,12 @@ class Listener:
         self._inputs: dict[str, Any] = {}
         self._frames: dict[str, str] = {}
         self._tracked: set[str] | None = None
-        self._tf = adapters.TransformBuffer()
+        self._tf, self._waiting = adapters.TransformBuffer(), adapters.MessageFilter(node.statistics, most=self.room)
         self._tf_asked_at: float | None = None
-        self._is_warned = self._is_refused = False
+        self.is_untransformed = False
+        """Whether people are shown as if their frame were that of the messages: there is no tf2_msgs."""
+        self._retry = node.create_timer(_RETRY_S, node.guarded("transforms", self._place), clock=clock)
+        self._retry.cancel()
         self._camera: adapters.Camera | None = None
 
     @property
@@ -132,6 +134,7 @@ class Listener:
         self._inputs.clear()
         self._frames.clear()
         self.since = self._tracked = self._tf_asked_at = self._camera = None
+        self._waiting, self.is_untransformed = adapters.MessageFilter(self._node.statistics, most=self.room), False
 
     def _listen(self, person: str, topic: str) -> None:
         full_name = self._node.resolve_topic_name(topic)
@@ -183,88 +186,61 @@ class Listener:
             for name, frame in self.stream.predicted(self._node.now_ns()).items():
                 self._put(name, frame, f"predicted {name}")
 
-    def _put(self, person: str, frame: Any, source: str) -> None:
-        assert self.scene is not None
+    def _put(self, person: str, frame: SmplFrame, source: str) -> None:
         try:
             adapters.check_plausible(frame)
-            placement = self._placement(self._frames.get(person, ""), frame.stamp_ns)
         except FrameError as error:
             self._refuse(source, error)
             return
-        except adapters.TransformError as error:
-            self._node.statistics.drop("transform", str(error))
-            return
-        up = up_of_sender(
-            self._settings.axes,
-            self._settings.frame_id if placement is not None else self._frames.get(person) or self._settings.frame_id,
-            np.eye(3) if placement is None else placement.rotation,
-        )
-        if not np.array_equal(frame.up, up.astype(np.float32)):
-            frame = replace(frame, up=up)
-        self.scene.put(person, frame, placement, self._camera_at(person, frame.stamp_ns))
+        given = "" if self.is_untransformed else self._frames.get(person)
+        self._waiting.put(adapters.Held(person, frame, given or self._settings.frame_id, self._node.now_ns()))
+        self._place()
+
+    def _place(self) -> None:
+        """Puts those who wait no longer for their transform into the scene."""
+        axes, target, now = self._settings.axes, self._settings.frame_id, self._node.now_ns()
+        for one, placement in self._waiting.ready(self._tf, target, now, self._settings.tolerance_ns):
+            seen_in = self._frames.get(one.person) if self.is_untransformed else ""
+            up = up_of_sender(axes, seen_in or target, placement.rotation).astype(np.float32)
+            frame = one.frame if np.array_equal(one.frame.up, up) else replace(one.frame, up=up)
+            assert self.scene is not None
+            self.scene.put(one.person, frame, placement, self._camera_at(one.person, frame.stamp_ns))
+        if bool(self._waiting) == self._retry.is_canceled():
+            self._retry.reset() if self._waiting else self._retry.cancel()
 
     # Frames ---------------------------------------------------------------------------------------
 
-    def _placement(self, given: str, stamp_ns: int) -> Placement | None:
-        """The placement from a frame to that of the messages; None if they are the same, or nobody sends transforms.
-
-        Raises `TransformError` where there are transforms, but none of this frame at this time.
-        """
-        target = self._settings.frame_id
-        if given in ("", target) or self._tf_asked_at is None:
-            return None
-        if not len(self._tf):
-            if time.monotonic() < self._tf_asked_at + _FIRST_TF_S:
-                msg = f"no transform has come yet, and the input is in {given}"
-                raise adapters.TransformError(msg)
-            self._warn(f"the input is in {given}, the garments are in {target}, and nobody sends transforms")
-            return None
-        tolerance = round(1e9 * self._settings.transform_tolerance)
-        found = self._tf.lookup(target, given, stamp_ns, tolerance_ns=tolerance)
-        if found.is_late:
-            self._node.statistics.count("late_transform")
-        return found
-
     def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
         """The camera where it was when this person was seen; None if there is none, or no transform of it."""
-        if (camera := self._camera) is None or not self._node.count_publishers(self._settings.camera_info):
+        settings, camera = self._settings, self._camera
+        if camera is None or not self._node.count_publishers(settings.camera_info):
             return None
+        is_theirs = camera.frame_id == self._frames.get(person) and (self.is_untransformed or not camera.frame_id)
+        given, tolerance = settings.frame_id if is_theirs else camera.frame_id, settings.tolerance_ns
         try:
-            way = self._placement(camera.frame_id, stamp_ns)
+            way = self._tf.lookup(given, settings.frame_id, stamp_ns, tolerance_ns=tolerance)
         except adapters.TransformError:
             self._node.statistics.count("skip.camera_without_transform")
             return None
-        if way is None and camera.frame_id not in (self._settings.frame_id, self._frames.get(person)):
-            return None
-        back = (way or adapters.Placement()).inverse()
         from refu_core.outputs import PinholeCamera  # loads torch
 
-        return PinholeCamera(camera.width, camera.height, camera.focal, camera.centre, back.rotation, back.translation)
+        return PinholeCamera(camera.width, camera.height, camera.focal, camera.centre, way.rotation, way.translation)
 
     def _on_camera(self, data: bytes) -> None:
         self._camera = adapters.decode_camera_info(data)
         self._need_transforms("the camera", self._camera.frame_id)
 
-    @property
-    def is_transformed(self) -> bool:
-        """Whether anybody sends transforms."""
-        return self._tf_asked_at is not None and len(self._tf) > 0
-
-    def _warn(self, text: str) -> None:
-        if not self._is_warned:
-            self._is_warned = True
-            self._node.get_logger().warning(f"{text}: set frame_id to the sender's frame if they are the same place")
-
     def _need_transforms(self, who: str, given: str) -> bool:
         """Subscribes to transforms once a frame isn't that of the messages; returns whether it differs."""
         target = self._settings.frame_id
         differs = given not in ("", target)
-        if differs and self._tf_asked_at is None and not self._is_refused:
+        if differs and self._tf_asked_at is None and not self.is_untransformed:
             try:
                 self._listen_to_tf()
             except RefuError as error:
-                self._is_refused = True
-                self._warn(f"{who} is in {given}, the garments are in {target}, nothing is transformed ({error})")
+                self.is_untransformed = True
+                text = f"{who} is in {given}, the garments are in {target}, nothing is transformed ({error})"
+                self._node.get_logger().warning(f"{text}: set frame_id to {given} if they are the same place")
         return differs
 
     def _listen_to_tf(self) -> None:
@@ -274,9 +250,10 @@ class Listener:
         self._tf, self._tf_asked_at = adapters.TransformBuffer(), time.monotonic()
 
     def _on_transforms(self, is_static: bool, data: bytes) -> None:
-        if n := self._tf.put(data, is_static=is_static):
-            why = "they make no sense: no frame, no finite numbers, or no rotation"
-            msg = f"{n} transforms left out: {f'more than {len(self._tf)} frames' if self._tf.is_full else why}"
+        refused = self._tf.put(data, is_static=is_static)
+        self._place()
+        if refused:
+            msg = f"{len(refused)} transforms left out, the first: {refused[0]}"
             raise RefuError(msg)
 
     # Humans (REP-155) -----------------------------------------------------------------------------

@@ -62,7 +62,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._refused: PipelineOptions | None = None
         self._lost = ""
         self._has_sent = False
-        self._listener = Listener(self)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # a simulation that stands still must not stop the diagnostics
+        self._listener = Listener(self, steady)
         self._outputs = make_outputs(tf=self.settings.publish_tf)
         self._bank = Bank(self, self._attend)
         # These live as long as the node: viewers stay connected while it is configured anew.
@@ -71,8 +72,6 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
         self._requests = Requests(self)
         self.add_on_set_parameters_callback(self._on_parameters)
-        # Steady time: a simulation that stands still must not stop the diagnostics.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_BEAT_S, self.guarded("each second", self._on_second), clock=steady)
         if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
@@ -313,6 +312,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         scene, since = self._listener.scene, self._listener.since
         if error:
             self.get_logger().error(f"not recording: {error}", throttle_duration_sec=60.0)
+        if report.recent["drop.transform"]:
+            self.get_logger().warning(report.reasons["transform"], throttle_duration_sec=LOG_PERIOD_S)
         if report.recent["drop.failed"]:
             self.get_logger().error(report.reasons["failed"], throttle_duration_sec=LOG_PERIOD_S)
         now = Situation(
@@ -320,7 +321,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             state=self._state,
             in_use=self._in_use,
             input_frame=self._listener.input_frame,
-            is_transformed=self._listener.is_transformed,
+            is_untransformed=self._listener.is_untransformed,
             has_foreign_betas=self._listener.doubts.has_foreign_betas and not self.settings.betas_are_told,
             doubted=self._listener.doubted,
             has_no_clock=bool(self.get_parameter("use_sim_time").value) and not self.now_ns(),

@@ -87,6 +87,7 @@ class Requests:
     def _on_dress(self, request: Any, response: Any) -> Any:
         settings, frame = asked_settings(request, self._node.settings), asked_frame(request)
         response.header = request.header
+        settings = settings.changed({"frame_id": request.header.frame_id.lstrip("/") or settings.frame_id})
         return self._dresser.ask(frame, settings, partial(self._dressed, response))
 
     def _send(self, send: Callable[[Any, Any], object], answer: Any, header: Any) -> None:

@@ -56,7 +56,9 @@ class NodeSettings(DressOptions):
     )
     frame_id: str = setting(WORLD_FRAME, "Frame of all that comes out; inputs of other frames are transformed (tf2).")
     transform_tolerance: float = setting(
-        0.1, "How much older than the input a transform may be [s]; without one it is dropped.", within=(0.0, 10.0)
+        0.1,
+        "An input waits so long for its transform, and then takes one as much older [s]; or is dropped.",
+        within=(0.0, 10.0),
     )
     points_fields: tuple[str, ...] = setting(
         POINT_FIELDS, f"What the points have besides x, y and z: of {', '.join(POINT_FIELDS)}."
@@ -132,6 +134,11 @@ class NodeSettings(DressOptions):
             return 0
         slowest = 1 / self.max_rate if self.max_rate else 0.0
         return round(1e9 * max(self.marker_lifetime, 2 * self.person_timeout, 2 * slowest))
+
+    @property
+    def tolerance_ns(self) -> int:
+        """`transform_tolerance` [ns]."""
+        return round(1e9 * self.transform_tolerance)
 
     @property
     def axes(self) -> InputAxes:

@@ -16,7 +16,7 @@ from msg_adapters import Placement
 from msg_adapters.axes import ros_from_sender
 from msg_adapters.outputs import Moment, make_outputs
 from msg_adapters.scene import Arrival, Scene
-from msg_adapters.statistics import Statistics
+from msg_adapters.statistics import COARSE_M, Statistics
 from refu_core import RefuError, SmplFrame
 from refu_core._device import is_device_loss
 from refu_core.history import PoseHistory
@@ -91,7 +91,7 @@ class Worker:
         self.fittings = self._planned_with = self._sent_with = fittings
         """The pipeline, and what is known of its garments; others may be put here at any time, for the next tick."""
         self._dressed: dict[str, _Known] = {}
-        self._history = PoseHistory()
+        self._history, self._told_in = PoseHistory(), (settings.frame_id, settings.axes)
         self._outputs = make_outputs(tf=settings.publish_tf)  # they remember what was worn
         self._here: set[str] = set()
         self._is_lost = False
@@ -164,6 +164,8 @@ class Worker:
         fittings = self.fittings
         if fittings is not self._planned_with:
             self._planned_with, self._is_lost = fittings, False
+        if self._told_in != (settings.frame_id, settings.axes):  # nobody has moved: they are only described anew
+            self._history, self._told_in = PoseHistory(), (settings.frame_id, settings.axes)
         gone = self._scene.leave(settings.person_timeout)
         near = self._near(arrivals, settings)
         gone += [person for person in arrivals if person not in near]
@@ -272,6 +274,8 @@ class Worker:
             arrival, output = batch.arrivals[person], self._dressed[person].output
             there = _there(arrival, batch.settings)
             offset = there.rotation @ frame.transl + there.translation
+            if np.abs(offset).max() >= COARSE_M:
+                self._statistics.count("coarse")
             worn.append(DressedPerson(person, frame, output, batch.fittings, there.rotation, offset, arrival.camera))
         self._here.update(frames)
         for row in self._outputs:

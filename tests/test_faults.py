@@ -364,7 +364,10 @@ def test_nodes_of_one_name_are_reported() -> None:
     now = Situation(node="n", state="active", persons=("",), recording=None, recording_error="", n_namesakes=1)
     found = statuses(Statistics().report(), NodeSettings(), now)
     status = status_of("garments", found)
-    assert (status.level, status.message) == (1, "2 nodes have this name: start others with -r __node:=another_name")
+    assert (status.level, status.message) == (
+        1,
+        "2 nodes have this name: start others with -r __ns:=/another_namespace",
+    )
 
 
 # Disks --------------------------------------------------------------------------------------------

@@ -165,6 +165,43 @@ def test_who_is_silent_leaves_once() -> None:
     assert scene.persons == ("b",)
 
 
+@given(st.floats(0.3, 1.8), st.lists(st.floats(-0.1, 0.1), min_size=6, max_size=30))
+def test_who_sends_seldom_stays_until_three_of_their_pauses_are_over(period: float, jitter: list[float]) -> None:
+    clock = Clock()
+    scene = Scene(Statistics(), clock=clock)
+    gone = []
+    for i, late in enumerate(jitter):
+        before, clock.now = clock.now, 10 + (i + late) * period
+        for now in np.linspace(before, clock.now, 8):
+            clock.now = now
+            gone += [i] * len(scene.leave(1.0))
+        scene.put("ann", frame())
+        scene.take(timeout=0.0)
+    assert {*gone} <= {1}, "before the second frame nobody knows how seldom they come"
+    clock.now += max(1.0, 2 * period)
+    assert scene.leave(1.0) == []
+    clock.now += max(0.1, 2 * period)
+    assert scene.leave(1.0) == ["ann"]
+
+
+def test_who_comes_again_after_a_while_is_soon_as_little_waited_for_as_before() -> None:
+    clock = Clock()
+    scene = Scene(Statistics(), clock=clock)
+    for now in (0.0, 0.1, 1.9, 2.0, 2.1, 2.2, 50.0, 50.1):
+        clock.now = now
+        scene.put("ann", frame())
+        scene.take(timeout=0.0)
+        assert scene.leave(1.0) == []
+    clock.now = 51.2
+    assert scene.leave(1.0) == ["ann"]
+    for i in range(1000):
+        clock.now += 1.5
+        scene.put(f"passer-by {i}", frame())
+        scene.take(timeout=0.0)
+        scene.leave(1.0)
+    assert len(scene._came) <= 3
+
+
 def test_more_people_than_there_is_room_for_are_left_out_and_counted() -> None:
     clock, statistics = Clock(), Statistics()
     scene = Scene(statistics, most=3, clock=clock)
@@ -438,6 +475,31 @@ def test_cloth_comes_to_rest_after_the_pose_has() -> None:
     np.testing.assert_allclose(points[-1], at_rest.viewer.messages[0][0].points, atol=1e-5)
 
 
+@pytest.mark.parametrize("changed", [{"input_axes": "frame"}, {"frame_id": "odom"}])
+def test_who_is_described_anew_has_not_moved(changed: dict[str, Any]) -> None:
+    """Somebody who stands still while a parameter of frames is set, at a rate at which people turn as far."""
+    setup = Setup(GarmentPipeline.load(["skirt-female"], sdf="none", collider=False), garments=["skirt-female"])
+    placement = Placement()
+    for i in range(8):
+        if i == 4:
+            setup.worker.settings = setup.worker.settings.changed(changed)
+            if "frame_id" in changed:
+                placement = Placement(Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.ones(3))
+        setup.scene.put("ann", frame(1e-6 * i, stamp_ns=(1 + i) * 10**9 // 4), placement)
+        setup.tick()
+    points = [markers[0].points for markers in setup.viewer.messages]
+    for before, now in pairwise(points[4:]):
+        np.testing.assert_allclose(now, before, atol=1e-4)
+
+
+@pytest.mark.parametrize(("x", "level"), [(8000.0, 0), (5.4e6, 1), (-9000.0, 1)])
+def test_coordinates_too_large_for_points_are_warned_of(pipeline: GarmentPipeline, x: float, level: int) -> None:
+    setup = Setup(pipeline)
+    setup.tick(ann=frame(transl=(x, 1.0, 0.0)))
+    status = report_of(setup.statistics)["garments"]
+    assert (status.level, "use a local frame_id" in status.message) == (level, bool(level))
+
+
 def test_nothing_is_done_for_nobody(pipeline: GarmentPipeline) -> None:
     setup = Setup(pipeline)
     setup.viewer.watching = False
@@ -666,6 +728,8 @@ def report_of(
     persons: tuple[str, ...] = ("",),
     given: Sequence[str] = ("",),
     has_foreign_betas: bool = False,
+    input_frame: str = "",
+    is_untransformed: bool = False,
     **settings: Any,
 ) -> dict[str, Any]:
     now = Situation(
@@ -675,6 +739,8 @@ def report_of(
         recording=recording,
         recording_error=recording.error if recording else "",
         has_foreign_betas=has_foreign_betas,
+        input_frame=input_frame,
+        is_untransformed=is_untransformed,
     )
     found = statuses(statistics.report(), NodeSettings().changed({"persons": [*given], **settings}), now)
     return {status.name.removeprefix("n: "): status for status in found}
@@ -1004,6 +1070,14 @@ def test_transforms_that_are_missing_are_reported() -> None:
     statistics.receive()
     statistics.count("late_transform")
     assert report_of(statistics)["input"].values["late transforms"] == "1"
+    statistics.receive()
+    statistics.count("late_transform")
+    status = report_of(statistics)["input"]
+    assert (status.level, status.message[:39]) == (1, "1 frames are placed by older transforms")
+    statistics.receive()
+    taken = report_of(statistics, input_frame="camera", is_untransformed=True)["input"]
+    assert (taken.level, taken.message[:23]) == (1, "camera is taken for map")
+    assert report_of(statistics, input_frame="camera")["input"].level == 0
     statistics.receive()
     statistics.drop("transform", "no transform leads from camera to map")
     status = report_of(statistics)["input"]

@@ -286,6 +286,8 @@ def test_bad_messages_are_records_and_the_rest_goes_on(tmp_path: Path) -> None:
     assert [record.stamp_ns for record in records] == [frame(0).stamp_ns, 101, 102, frame(3).stamp_ns]
     assert "header of 4 bytes, got 0 bytes" in str(records[1].error)
     assert "NaN" in str(records[2].error)
+    for record in records:
+        assert (len(repr(record).splitlines()), len(repr(record)) < 300) == (1, True)
 
 
 def test_a_message_received_at_an_impossible_time(tmp_path: Path) -> None:

@@ -15,14 +15,19 @@ from scipy.spatial.transform import Rotation, Slerp
 from msg_adapters import (
     TF_MESSAGE,
     DecodeError,
+    Held,
+    MessageFilter,
     Placement,
     TransformBuffer,
     TransformError,
 )
 from msg_adapters.axes import InputAxes, up_of_sender
+from msg_adapters.statistics import Statistics
 from msg_adapters.transforms import HISTORY_NS, Transform, decode_transforms, encode_transforms
+from refu_core import SmplFrame
 
 S = 10**9
+MS = 10**6
 
 
 def transform(parent: str, child: str, stamp_ns: int = 0, seed: int = 0, **other: Any) -> Transform:
@@ -32,7 +37,7 @@ def transform(parent: str, child: str, stamp_ns: int = 0, seed: int = 0, **other
 
 
 def put(buffer: TransformBuffer, *transforms: Transform, is_static: bool = False) -> int:
-    return buffer.put(encode_transforms(transforms), is_static=is_static)
+    return len(buffer.put(encode_transforms(transforms), is_static=is_static))
 
 
 def matrix(one: Transform | Placement) -> Any:
@@ -140,10 +145,46 @@ def test_what_makes_no_sense_is_left_out_and_counted() -> None:
     ]
     assert put(buffer, *bad) == len(bad)
     assert len(buffer) == 0
+    (said,) = buffer.put(encode_transforms(bad[4:5]), is_static=False)
+    assert said == "'cam' in 'map', which is no rotation: wanted a quaternion of length 1, got 2"
     put(buffer, transform("a", "b"), transform("b", "a"))  # a ring ends
-    with pytest.raises(TransformError):
-        buffer.lookup("map", "a", 0)
-    buffer.lookup("a", "b", 0)
+    for target, source in (("map", "a"), ("a", "b"), ("b", "a")):
+        with pytest.raises(TransformError, match=r"ring, end who sends one of these: (a in b in a|b in a in b)$"):
+            buffer.lookup(target, source, 0)
+
+
+@pytest.mark.parametrize("stray", ["cam", "odom", "wrist"])
+def test_a_ring_is_an_error_only_for_those_whose_way_goes_along_it(stray: str) -> None:
+    """A transform too many, of the map in a frame below it: which of the two ways is meant?"""
+    buffer = TransformBuffer()
+    put(buffer, transform("map", "odom", S, 1), transform("odom", "cam", S, 2), transform("cam", "lens", S, 3))
+    put(buffer, transform("odom", "wrist", S, 4), transform("wrist", "tip", S, 5))
+    before = {pair: matrix(buffer.lookup(*pair, S)) for pair in (("cam", "lens"), ("wrist", "tip"))}
+    put(buffer, transform(stray, "map", S, 6))
+    ring = {"cam": "cam in odom in map", "odom": "odom in map", "wrist": "odom in map in wrist"}[stray]
+    for source in ("odom", "cam", "lens"):
+        with pytest.raises(TransformError, match="frames form a ring") as raised:
+            buffer.lookup("map", source, S)
+        assert {*str(raised.value).partition("these: ")[2].split(" in ")} == {*ring.split(" in ")}
+        with pytest.raises(TransformError, match="frames form a ring"):
+            buffer.known_until("map", source)
+    for pair, found in before.items():  # what hangs on the ring without going along it
+        np.testing.assert_array_equal(matrix(buffer.lookup(*pair, S)), found)
+
+
+@given(st.lists(st.tuples(st.integers(1, 30), st.booleans()), min_size=1, max_size=6), st.integers(0, 40))
+def test_until_when_a_way_is_known_is_when_it_needs_no_tolerance(links: list[tuple[int, bool]], tenths: int) -> None:
+    buffer = TransformBuffer()
+    for i, (newest, is_static) in enumerate(links):
+        ones = [transform(f"f{i}", f"f{i + 1}", stamp * S // 10, i) for stamp in (0, newest)]
+        put(buffer, *ones, is_static=is_static)
+    until = buffer.known_until("f0", f"f{len(links)}")
+    assert until == min((newest * S // 10 for newest, is_static in links if not is_static), default=2**63 - 1)
+    if tenths * S // 10 <= until:
+        buffer.lookup("f0", f"f{len(links)}", tenths * S // 10)
+    else:
+        with pytest.raises(TransformError, match="older than the input"):
+            buffer.lookup("f0", f"f{len(links)}", tenths * S // 10)
 
 
 def test_no_way_is_so_long_that_nobody_else_is_served() -> None:
@@ -222,3 +263,101 @@ def test_up_is_where_the_frame_of_the_messages_has_it(
 ) -> None:
     turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     np.testing.assert_allclose(up_of_sender(axes, frame_id, turn), up, atol=1e-12)
+
+
+# Waiting ------------------------------------------------------------------------------------------
+
+
+class Camera:
+    """A camera that moves by 1 m/s along x, a filter, and the time; what came through it is in `shown`."""
+
+    def __init__(self, *, tolerance_ns: int = 100 * MS) -> None:
+        self.now_ns, self.tolerance_ns, self.steady = 5 * S, tolerance_ns, 0.0
+        self.buffer, self.statistics = TransformBuffer(clock=lambda: self.steady), Statistics()
+        self.filter = MessageFilter(self.statistics, most=3)
+        self.steady = 2.0
+        self.shown: list[tuple[str, int, float]] = []
+
+    def sees(self, stamp_ns: int, person: str = "", frame_id: str = "cam") -> None:
+        self.filter.put(Held(person, SmplFrame(np.zeros((24, 3)), stamp_ns=stamp_ns), frame_id, self.now_ns))
+        self.looks()
+
+    def is_at(self, stamp_ns: int) -> None:
+        put(self.buffer, Transform(stamp_ns, "map", "cam", [1e-9 * stamp_ns, 0, 0], [0, 0, 0, 1]))
+        self.looks()
+
+    def looks(self) -> None:
+        for one, placement in self.filter.ready(self.buffer, "map", self.now_ns, self.tolerance_ns):
+            self.shown.append((one.person, one.frame.stamp_ns, placement.translation[0]))
+
+    def counted(self, key: str) -> int:
+        return self.statistics.report().total[key]
+
+
+@pytest.mark.parametrize("hz", [10, 30, 100])
+@pytest.mark.parametrize("delay_ms", [5, 10, 50, 150])
+def test_who_is_seen_by_a_moving_camera_is_where_it_was_then(hz: int, delay_ms: int) -> None:
+    """However much later than its input each transform comes, as long as it is less than the tolerance."""
+    camera = Camera(tolerance_ns=200 * MS)
+    steps = [(5 * S + i * S // hz, i) for i in range(2 * hz)]
+    events = [(stamp, camera.sees, stamp) for stamp, _ in steps]
+    events += [(stamp + delay_ms * MS, camera.is_at, stamp) for stamp, _ in steps]
+    for now_ns, happens, stamp in sorted(events, key=lambda one: one[0]):
+        camera.now_ns = now_ns
+        happens(stamp)
+    assert [stamp for _, stamp, _ in camera.shown] == [stamp for stamp, _ in steps]
+    assert [x for *_, x in camera.shown] == pytest.approx([1e-9 * stamp for stamp, _ in steps], abs=1e-9)
+    assert (camera.counted("late_transform"), len(camera.filter)) == (0, 0)
+
+
+def test_of_those_whose_wait_ends_at_once_the_scene_gets_what_it_has_room_for() -> None:
+    camera = Camera()
+    camera.is_at(5 * S)
+    for ms in range(10, 60, 10):
+        camera.sees(5 * S + ms * MS)
+    camera.is_at(5 * S + 45 * MS)
+    assert [stamp for _, stamp, _ in camera.shown] == [5 * S + 30 * MS, 5 * S + 40 * MS]
+    assert (camera.counted("skip.superseded"), len(camera.filter)) == (2, 1)
+
+
+def test_what_has_waited_in_vain_is_placed_late_or_dropped_and_that_is_counted() -> None:
+    camera = Camera()
+    camera.is_at(5 * S)
+    camera.sees(5 * S + 40 * MS, "ann")
+    camera.sees(5 * S + 150 * MS, "bob")
+    camera.sees(5 * S, "eve", "map")  # needs none
+    camera.now_ns += 99 * MS
+    camera.looks()
+    assert camera.shown == [("eve", 5 * S, 0.0)]
+    camera.now_ns += MS
+    camera.looks()
+    assert camera.shown[1:] == [("ann", 5 * S + 40 * MS, 5.0)]
+    report = camera.statistics.report()
+    assert (report.total["late_transform"], report.total["drop.transform"], len(camera.filter)) == (1, 1, 0)
+    assert report.reasons["transform"] == "bob: the newest transform of cam is 0.150 s older than the input"
+
+
+def test_without_transforms_nobody_is_placed_and_the_reason_says_what_to_do() -> None:
+    camera = Camera(tolerance_ns=0)
+    camera.steady = 0.5
+    camera.sees(5 * S)
+    assert (camera.counted("drop.transform"), camera.counted("skip.first_transforms")) == (0, 1)
+    camera.steady = 1.5
+    camera.sees(6 * S)
+    assert camera.shown == []
+    reason = camera.statistics.report().reasons["transform"]
+    assert reason.startswith("no transform leads from cam to map, none has come: start what sends /tf, or set frame_id")
+
+
+def test_what_waits_is_bounded_and_no_clock_holds_it_for_ever() -> None:
+    camera = Camera(tolerance_ns=10 * S)
+    camera.is_at(5 * S)
+    for i in range(100):  # time stands still
+        camera.sees(5 * S + 1 + i, "ann")
+    assert [stamp for _, stamp, _ in camera.shown] == [5 * S + 1 + i for i in range(68)]  # each late, none twice
+    for person in ("bob", "cyd", "dan", "eve"):
+        camera.sees(6 * S, person)
+    assert (len(camera.filter), camera.counted("drop.crowd")) == (3, 2)
+    camera.now_ns = S  # a simulation begins anew
+    camera.looks()
+    assert len(camera.filter) == 0

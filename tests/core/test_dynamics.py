@@ -74,6 +74,12 @@ def past_of(frames: Iterator[SmplFrame]) -> NDArray[np.float32]:
     return past
 
 
+def turned(pose: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
+    """The pose (24, 3) of somebody who faces elsewhere."""
+    root = Rotation.from_euler("y", degrees, degrees=True) * Rotation.from_rotvec(pose[0])
+    return np.concatenate((root.as_rotvec()[None], pose[1:])).astype(np.float32)
+
+
 def played(motion: Motion, *, until: float, fps: float, seconds: float = 1.0) -> Iterator[SmplFrame]:
     n = round(seconds * fps)
     return (motion(until - (n - i) / fps) for i in range(n + 1))
@@ -138,7 +144,7 @@ def test_who_stands_or_glides_has_no_past(seed: int) -> None:
     assert not told[0].any()  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("break_", ["clock back", "long pause", "leap"])
+@pytest.mark.parametrize("break_", ["clock back", "long pause", "leap", "turn"])
 def test_what_does_not_go_on_starts_anew(break_: str) -> None:
     motion, history = a_motion(3), PoseHistory()
     for frame in played(motion, until=10.0, fps=FPS):
@@ -149,10 +155,30 @@ def test_what_does_not_go_on_starts_anew(break_: str) -> None:
         "clock back": replace(motion(10.1), stamp_ns=5 * 10**9),
         "long pause": motion(10.26),
         "leap": replace(motion(10.1), transl=motion(10.1).transl + np.array((0, 0, 2.0))),
+        "turn": replace(motion(10.24), pose=turned(motion(10.24).pose, 180)),
     }[break_]
     told = history(frame).past
     assert told is not None
     assert not told.any()
+
+
+@pytest.mark.parametrize(("fps", "degrees_s"), [(30, 360), (30, 600), (5, 600), (120, 600)])
+def test_who_turns_as_fast_as_people_do_goes_on(fps: int, degrees_s: float) -> None:
+    """Recorded roots reach 355 degrees a second."""
+    stands = np.zeros((24, 3), np.float32)
+    frames = [
+        SmplFrame(turned(stands, degrees_s * i / fps), stamp_ns=round(1e9 * (1 + i / fps))) for i in range(fps // 2 + 1)
+    ]
+    assert all(frame.past is not None and frame.past.any() for frame in PoseHistory.told(frames)[1:])
+
+
+@pytest.mark.parametrize("fps", [5, 10, 30, 60])
+def test_a_frame_that_faces_backwards_swings_nothing(fps: int) -> None:
+    """Trackers take front for back, in one frame or for good."""
+    stands = np.zeros((24, 3), np.float32)
+    poses = [turned(stands, 175 if i in {2, 4, 5} else 0) for i in range(8)]
+    frames = [SmplFrame(pose, stamp_ns=round(1e9 * (1 + i / fps))) for i, pose in enumerate(poses)]
+    assert not any(frame.past.any() for frame in PoseHistory.told(frames) if frame.past is not None)
 
 
 def test_a_message_that_comes_twice_or_upon_the_last_one_ends_nothing() -> None:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -393,6 +394,48 @@ def test_without_transforms_the_frame_is_warned_of(
     scene.peer.diagnostics.clear()
     scene.until(lambda: scene.peer.diagnostics, "the node says how it is")
     assert scene.peer.status("input")[2]["frame"] == "camera, shown as map"
+    scene.peer.diagnostics.clear()
+
+    def warned() -> bool:
+        scene.peer.send_raw(encoder_for("joint_state")(frame(1), frame_id="camera"))
+        return "camera is taken for map" in (scene.peer.status("input") or ("", ""))[1]
+
+    scene.until(warned, "as long as that lasts, the diagnostics warn of it")
+
+
+def test_an_input_waits_for_its_transform(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
+    """Nobody is where they aren't: not before there are transforms, nor where a camera was before it moved."""
+    kind = foreign("tf2_msgs/msg/TFMessage")
+    scene = robot(garments=[TSHIRT], input_axes="frame", transform_tolerance=10.0, person_timeout=60.0)
+    scene.hear("points", PointCloud2)
+    moving = scene.peer.node.create_publisher(kind, "/tf", 10)
+    mesh = GarmentPipeline.load([TSHIRT], backbone="skinned", sdf="none")(frame(0))[TSHIRT]
+
+    def sees(stamp_ns: int) -> None:
+        sent = replace(frame(0), stamp_ns=stamp_ns)
+        scene.peer.send_raw(encoder_for("joint_state")(sent, frame_id="camera"))
+
+    def missed() -> bool:
+        sees(1)
+        return "none has come: start what sends /tf" in scene.node.statistics.report().reasons["transform"]
+
+    scene.node.set_parameters([Parameter("transform_tolerance", value=0.1)])
+    scene.until(missed, "that there are none is said")
+    assert scene.heard["points"] == []
+    scene.node.set_parameters([Parameter("transform_tolerance", value=10.0)])
+    scene.until(lambda: moving.get_subscription_count(), "they are listened to")
+    for step in range(5, 10):
+        sees(step * 10**9)
+        scene.until(lambda: scene.node._listener._waiting, "it waits")
+        place = Transform(step * 10**9, "map", "camera", [float(step), 0, 0], [0, 0, 0, 1])
+        moving.publish(encode_transforms([place]))
+        scene.until(lambda of=step: [m.header.stamp.sec for m in scene.heard["points"]][-1:] == [of], "it comes")
+        points = points_of(scene.heard["points"][-1])
+        np.testing.assert_allclose(points["x"], mesh.vertices[:, 0] + step, atol=1e-5)
+    scene.node.set_parameters([Parameter("transform_tolerance", value=0.1)])
+    sees(9 * 10**9 + 10**7)
+    scene.until(lambda: len(scene.heard["points"]) == 6, "what has waited in vain comes without any other event")
+    assert scene.node.statistics.report().total["late_transform"] == 1
 
 
 def test_each_person_is_where_their_own_marker_is(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -13,15 +14,17 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from action_msgs.msg import GoalStatus
-from harness import GARMENTS, ROOT, NodeProcess, Peer, frame
+from harness import GARMENTS, PATIENCE_S, ROOT, NodeProcess, Peer, frame, ros_arguments
 from rclpy.action import ActionClient
+from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
 import msg_adapters as adapters
 from msg_adapters import BagReader, BagWriter
 from msg_adapters.axes import SMPL_COLUMNS
-from refu_core import GarmentPipeline, SmplFrame
+from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_ros._bag_job import BagJob
+from refu_ros._node import GarmentNode
 from refu_ros._requests import _fill
 from refu_ros._settings import NodeSettings
 
@@ -133,6 +136,33 @@ def test_a_frame_is_dressed_as_by_the_library(peer: Peer) -> None:
     assert (garment.n_inside, garment.n_unresolved) == (stats.n_inside, stats.n_unresolved)
     assert answer.largest_shift == pytest.approx(wanted.stats.shift.largest, abs=1e-6)
     assert answer.within_promise
+
+
+def test_cloth_hangs_down_in_the_frame_of_the_request(ros: None, messages: Path) -> None:  # noqa: ARG001
+    """A camera's, for somebody who stands upright in it, whichever frame the topics are in."""
+    from refu_msgs.srv import Dress
+
+    pose = np.zeros((24, 3))
+    pose[0] = Rotation.from_euler("x", 180, degrees=True).as_rotvec()
+    request = Dress.Request(header=Header(frame_id="camera_optical_frame"), pose=pose.ravel(), transl=[0.0, 0.2, 3.0])
+    skirt = {"garments": ["skirt-female"], "sdf": "none", "collider": False, "input_axes": "frame"}
+    node = GarmentNode(cli_args=ros_arguments(skirt), namespace="robot")
+    try:
+        answer = node._requests._on_dress(request, Dress.Response()).result(PATIENCE_S)
+        request.header.frame_id = "my frame"
+        with pytest.raises(RefuError, match="frame_id: wanted a name"):
+            node._requests._on_dress(request, Dress.Response())
+    finally:
+        node.close()
+        node.destroy_node()
+    got = np.array([(point.x, point.y, point.z) for point in answer.garments[0].mesh.vertices])
+    pipeline = GarmentPipeline.load(["skirt-female"], sdf="none", collider=False)
+    sent = SmplFrame(pose, transl=np.array([0.0, 0.2, 3.0]))
+    hangs, of_map = (
+        pipeline(replace(sent, up=np.array(up)))["skirt-female"].vertices for up in ((0, -1, 0), (0, 0, 1))
+    )
+    np.testing.assert_allclose(got, hangs, atol=1e-6)
+    assert np.abs(hangs - of_map).max() > 0.01
 
 
 def test_requests_leave_the_stream_as_it_is(peer: Peer) -> None:
