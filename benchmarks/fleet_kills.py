@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 ROWS = "shard-0-of-1"
-REFU = [sys.executable, "-m", "refu_lab.cli"]
+REFU = [sys.executable, "-m", "refu_lab"]
 
 
 class Cluster:

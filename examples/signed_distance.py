@@ -28,11 +28,11 @@ def main() -> tuple[float, float]:
     for point, distance, gradient in zip(points, sample.distance, sample.gradient, strict=True):
         print(f"{rounded(point)}: {distance.item():+.3f} m, grows towards {rounded(gradient)}")
 
-    sample.distance.sum().backward()
-    off = float((points.grad - sample.gradient.detach()).abs().max())
+    along_points, along_vertices = torch.autograd.grad(sample.distance.sum(), (points, vertices))
+    off = float((along_points - sample.gradient.detach()).abs().max())
     # Moving the whole surface outwards by a millimetre brings each of the points a millimetre deeper.
     outward = torch.nn.functional.normalize(vertices.detach(), dim=1)
-    slope = float((vertices.grad * outward).sum()) / len(points)
+    slope = float((along_vertices * outward).sum()) / len(points)
     print(f"the gradient is the derivative to {off:.0e}; distance per outward motion of the surface: {slope:+.2f}")
     return off, slope
 

@@ -29,6 +29,9 @@ class Motion(Recording):
     source: str = "motion"
     """What it was read from: errors begin with it."""
 
+    def __repr__(self) -> str:
+        return f"Motion({self.source}: {len(self)} frames at {self.fps:g} Hz, {self.gender})"
+
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.poses)

@@ -11,6 +11,7 @@ Most names are imported on first use, so that code that only needs `SmplFrame` d
 from __future__ import annotations
 
 from importlib import import_module
+from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any
 
 from refu_core._versions import VERSION
@@ -77,12 +78,19 @@ _LAZY = {
 """The package that each name is imported from on first use."""
 
 
+def _packages() -> set[str]:
+    """The names of its packages and modules that others may use."""
+    return {module.name for module in iter_modules(__path__) if not module.name.startswith("_")}
+
+
 def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        msg = f"module {__name__!r} has no attribute {name!r}"
-        raise AttributeError(msg)
-    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+    if name in _LAZY:
+        return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+    if name in _packages():
+        return import_module(f"{__name__}.{name}")
+    msg = f"module {__name__!r} has no attribute {name!r}"
+    raise AttributeError(msg)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, *_packages(), *(name for name in globals() if name.startswith("__"))})

@@ -177,7 +177,7 @@ def side_by_side(works: Sequence[Callable[[], Result]], device: torch.device) ->
 @functools.cache
 def _beside(stream: torch.cuda.Stream, n: int) -> list[torch.cuda.Stream]:
     """Streams for works that run side by side, kept for later calls."""
-    return [torch.cuda.Stream(stream.device) for _ in range(n)]  # type: ignore[no-untyped-call]
+    return [torch.cuda.Stream(stream.device) for _ in range(n)]
 
 
 @contextlib.contextmanager

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from refu_core.errors import FrameError
 
@@ -19,6 +19,7 @@ LAGS = (1 / 15, 2 / 15, 4 / 15, 8 / 15)
 latest motion counts most."""
 N_PAST = 9 * N_JOINTS + 3
 """Numbers per lag: those of each joint's rotation, and of the root's place."""
+_PAST = (len(LAGS), N_PAST)
 # There are two levels of limits. A frame accepts whatever can be computed with, as a study may go beyond real bodies.
 # A stream of messages has no such purpose, so a node refuses implausible values (`msg_adapters.check_plausible`): no
 # sender means them.
@@ -69,57 +70,76 @@ def checked_numbers(
     return array
 
 
-@dataclass(frozen=True, eq=False)
+def _direction(name: str, value: ArrayLike) -> NDArray[np.float32]:
+    """`value` as a read-only unit vector, shape (3,)."""
+    given = checked_numbers(name, value, (3,), np.float64)
+    with np.errstate(over="ignore"):  # an infinite length is no direction, either
+        length = float(np.linalg.norm(given))
+    if not 1e-6 <= length <= 1e6:
+        msg = f"{name} must be a direction, of a length from 1e-6 to 1e6, got {value!r}"
+        raise FrameError(msg)
+    return checked_numbers(name, given / length, (3,), np.float32)
+
+
+def _nanoseconds(name: str, value: Any) -> int:
+    """`value` as a whole number."""
+    try:
+        return int(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        msg = f"{name} must be a whole number of nanoseconds, got {value!r}"
+        raise FrameError(msg) from error
+
+
+@dataclass(frozen=True, eq=False, init=False)
 class SmplFrame:
     """Parameters of one SMPL body at one time; validated, immutable, in SMPL axes (y up, z forward, left = +x).
 
     The root and `transl` may be in any other right-handed axes, as long as `up` says which way is up there.
-
-    Raises `FrameError` when an array has a wrong number of elements, isn't finite, or is out of range.
     """
 
     pose: NDArray[np.float32]
-    """Rotation vector of each joint relative to its parent, root first [rad], shape (24, 3) (or flat, (72,))."""
-    betas: NDArray[np.float32] = field(default_factory=lambda: np.zeros(N_BETAS, np.float32))
+    """Rotation vector of each joint relative to its parent, root first [rad], shape (24, 3)."""
+    betas: NDArray[np.float32]
     """Shape coefficients in standard deviations, shape (10,)."""
-    transl: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    transl: NDArray[np.float64]
     """Added to the posed vertices [m], shape (3,); float64, so that a body far from the origin loses no precision."""
-    style: NDArray[np.float32] | None = None
+    style: NDArray[np.float32] | None
     """Garment style γ in standard deviations, shape (4,); None for the wearer's usual one."""
-    stamp_ns: int = 0
+    stamp_ns: int
     """Time of the measurement [ns since the epoch of the sender's clock]."""
-    up: NDArray[np.floating] = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
-    """Direction away from the ground, in the axes of the root and `transl`, shape (3,); of a length from 1e-6 to
-    1e6, kept as a unit vector. Cloth hangs the other way."""
-    past: NDArray[np.float32] | None = None
+    up: NDArray[np.floating]
+    """Direction away from the ground, in the axes of the root and `transl`: a unit vector, shape (3,). Cloth hangs the
+    other way."""
+    past: NDArray[np.float32] | None
     """How the person has moved until now, as `PoseHistory` describes it, shape (4, 219); None for no motion."""
 
-    def __post_init__(self) -> None:
-        # A frozen dataclass is normalised through object.__setattr__, once, here.
-        object.__setattr__(self, "pose", checked_numbers("pose", self.pose, (N_JOINTS, 3), np.float32, MAX_ANGLE))
-        object.__setattr__(self, "betas", checked_numbers("betas", self.betas, (N_BETAS,), np.float32, MAX_COEFFICIENT))
-        object.__setattr__(self, "transl", checked_numbers("transl", self.transl, (3,), np.float64))
-        if self.style is not None:
-            object.__setattr__(
-                self, "style", checked_numbers("style", self.style, (N_STYLES,), np.float32, MAX_COEFFICIENT)
-            )
-        up = checked_numbers("up", self.up, (3,), np.float64)
-        with np.errstate(over="ignore"):  # an infinite length is no direction, either
-            length = float(np.linalg.norm(up))
-        if not 1e-6 <= length <= 1e6:
-            msg = f"up must be a direction, of a length from 1e-6 to 1e6, got {self.up!r}"
-            raise FrameError(msg)
-        object.__setattr__(self, "up", checked_numbers("up", up / length, (3,), np.float32))
-        if self.past is not None:
-            past = checked_numbers("past", self.past, (len(LAGS), N_PAST), np.float32, MAX_COEFFICIENT)
-            object.__setattr__(self, "past", past)
-        try:
-            object.__setattr__(self, "stamp_ns", int(self.stamp_ns))
-        except (TypeError, ValueError, OverflowError) as error:
-            msg = f"stamp_ns must be a whole number of nanoseconds, got {self.stamp_ns!r}"
-            raise FrameError(msg) from error
+    def __init__(
+        self,
+        pose: ArrayLike,
+        betas: ArrayLike = (0.0,) * N_BETAS,
+        transl: ArrayLike = (0.0, 0.0, 0.0),
+        style: ArrayLike | None = None,
+        stamp_ns: int = 0,
+        up: ArrayLike = (0.0, 1.0, 0.0),
+        past: ArrayLike | None = None,
+    ) -> None:
+        """A frame of these numbers, each in its field's shape or flat; `up` of any length from 1e-6 to 1e6.
+
+        Raises `FrameError` when an array has a wrong number of elements, isn't finite, or is out of range.
+        """
+        vars(self).update(  # a frozen dataclass is filled once, here
+            pose=checked_numbers("pose", pose, (N_JOINTS, 3), np.float32, MAX_ANGLE),
+            betas=checked_numbers("betas", betas, (N_BETAS,), np.float32, MAX_COEFFICIENT),
+            transl=checked_numbers("transl", transl, (3,), np.float64),
+            style=None if style is None else checked_numbers("style", style, (N_STYLES,), np.float32, MAX_COEFFICIENT),
+            stamp_ns=_nanoseconds("stamp_ns", stamp_ns),
+            up=_direction("up", up),
+            past=None if past is None else checked_numbers("past", past, _PAST, np.float32, MAX_COEFFICIENT),
+        )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Checks a copy and makes it read-only, too: NumPy forgets that when it copies or pickles."""
-        self.__dict__.update(state)
-        self.__post_init__()
+        SmplFrame.__init__(self, **state)
+
+    def __repr__(self) -> str:
+        return f"SmplFrame(transl={self.transl.tolist()}, stamp_ns={self.stamp_ns})"

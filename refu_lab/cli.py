@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
+import logging
 import os
 import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -21,7 +24,9 @@ from refu_lab.commands._common import (
     EXIT_BUG,
     EXIT_CHECK_FAILED,
     EXIT_INTERRUPTED,
+    EXIT_UNREAD,
     Parser,
+    add_subcommands,
     check_writable,
     require_apart,
     require_distinct,
@@ -34,7 +39,7 @@ _OF_LAB = ("matplotlib", "PIL", "tqdm")
 def _parser() -> Parser:
     parser = Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
     parser.add_argument("--version", action="version", version=f"refu {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=Parser)
+    commands = add_subcommands(parser, metavar="COMMAND")
     for command in COMMANDS:
         command.add(commands)
     return parser
@@ -46,9 +51,15 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal or file that has no → gets a ?
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it can't write to
     before = signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
     try:
-        args = _parser().parse_args(arguments)
+        try:
+            args = _parser().parse_args(arguments)
+        finally:  # after its help the parser ends the program
+            print(end="", flush=True)
         written = _outputs(args)
         for path in written.values():
             check_writable(path)
@@ -57,6 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for given in _inputs(args, written=path):
                 require_apart(given, path)
         code: int = args.run(args)
+        print(end="", flush=True)
+    except BrokenPipeError:  # who read the output has gone (| head)
+        return EXIT_UNREAD
     except RefuError as error:
         return _failed(f"error: {error}", EXIT_BAD_INPUT)
     except (OSError, UnicodeError, MemoryError, RecursionError) as error:
@@ -76,7 +90,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", EXIT_BUG)
     finally:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+        _drop_unwritable()
     return code
+
+
+def _drop_unwritable() -> None:
+    """Output that can't be written goes nowhere: at its end the interpreter would try again, and complain."""
+    try:
+        print(end="", flush=True)
+    except OSError:
+        with suppress(OSError):  # it may be no file
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 _WRITTEN = ("json", "output", "report", "picture")

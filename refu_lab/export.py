@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -62,6 +63,17 @@ def meshes_of(
     return found
 
 
+def require_new(path: Path, count: int) -> None:
+    """Raises `RefuError` if a file that `write_meshes` would make of `count` frames is there already."""
+    suffix, number = path.suffix.lower(), "[0-9]" * len(str(count - 1))
+    is_one = count == 1 or suffix in _USD
+    found = path.parent.glob(glob.escape(path.name) if is_one else f"{glob.escape(path.stem)}_{number}{suffix}")
+    there = next(found, None)
+    if there is not None:
+        msg = f"{there} is there already: name another file, or --overwrite it"
+        raise RefuError(msg)
+
+
 def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps: float = 30.0) -> list[Path]:
     """Writes meshes of T frames: one animated USD stage, or a GLB or OBJ file a frame, numbered if there are several.
 
@@ -103,7 +115,7 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
 
 
 def export(
-    options: RecordingOptions, path: Path, *, first: int, count: int, with_body: bool
+    options: RecordingOptions, path: Path, *, first: int, count: int, with_body: bool, overwrite: bool = False
 ) -> tuple[list[Path], list[str]]:
     """What `refu export` does: writes some frames of a bag or motion file, dressed; returns the files and the warnings.
 
@@ -111,12 +123,15 @@ def export(
     the input's axes are, y is up in the files.
 
     Raises:
-        RefuError: as `write_meshes`; options that make no pipeline, an input that can't be read, or no frame.
+        RefuError: as `write_meshes`; a file that is there already, unless `overwrite`; options that make no pipeline,
+            an input that can't be read, or no frame.
     """
     from refu_lab.sources import open_source
 
     if path.suffix.lower() not in FORMATS:  # raises before the work is done
         write_meshes((), path)
+    if not overwrite:
+        require_new(path, count)
     load = cache(options.load_pipeline)
     source = open_source(options, lambda: load().body)
     pipeline = load()
@@ -148,6 +163,8 @@ def export(
     meshes = meshes_of(pipeline, outputs, with_body=with_body)
     if turn[1, 1] != 1:
         meshes = [replace(mesh, vertices=mesh.vertices @ turn.T) for mesh in meshes]
+    if not overwrite and len(outputs) < count:  # then the files have other names
+        require_new(path, len(outputs))
     return write_meshes(meshes, path, fps=fps), warnings
 
 

@@ -17,7 +17,7 @@ from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
 from refu_lab.render import SKIN, RenderMesh, Viewpoint, colliding_vertices, collision_mesh, render, save_png
 from refu_lab.replay import Findings, FrameResult, ReplayResult, When
-from refu_lab.tables import REPLAY_HEADER, REPLAY_TITLE, html_page, html_table, replay_rows
+from refu_lab.tables import REPLAY_TITLE, html_page, html_table, meanings, replay_columns
 from refu_lab.turntable import STYLE as TURNTABLE_STYLE
 from refu_lab.turntable import Frame, Mesh, MeshInFrame, turntable
 
@@ -171,18 +171,20 @@ def _page(result: ReplayResult, frames: Sequence[Frame], turned: str) -> str:
     warning = "".join(f'<p class="warn">{html.escape(note)}</p>' for note in notes)
     figures = "".join(map(_figure, frames))
     frame, shift = data["latency_ms"], data["skin_shift_mm"]
+    header, rows = replay_columns(data["garments"])
     body = f"""<p class="note">{html.escape(result.source)}; backbone {html.escape(data["backbone"])}, signed distance
 {html.escape(data["sdf"])}, margin {1e3 * data["margin_m"]:g} mm, {html.escape(data["device"])}.
 {data["frames"]} frames; skin moved to be free of itself: {shift["mean"]:.2f} mm on average,
 {shift["largest"]:.1f} mm at most.
 A whole frame, bytes to bytes: p50 {frame["p50"]:.1f}, p95 {frame["p95"]:.1f}, p99 {frame["p99"]:.1f} ms.</p>{warning}
-<h2>Figures</h2><div class='wide'>{html_table(REPLAY_HEADER, replay_rows(data["garments"]))}</div>
-<p class="note">VFCP: vertices inside the body. CFMP: frames without any collision, vertices and triangles.
-Both by exact checks of every frame and every vertex, against the collider: the posed body with its overlaps (an arm in
-the flank, thighs in a squat) pulled apart. The last column is against the skin, which runs through itself there. Folds:
-their energy over that of the true garment's, from the finest to the widest; below 1 it is smoother than cloth.</p>
+<h2>Figures</h2><div class='wide'>{html_table(header, rows)}</div>
+<p class="note">{meanings(header)}. Collisions, of vertices and of triangles, are found by exact checks of every frame,
+against the collider: the posed body with its overlaps (an arm in the flank, thighs in a squat) pulled apart. A - is a
+figure that the recording doesn't give.</p>
 <h2>Worst, median and best frame</h2>{turned}
-<p class="note">Drag to turn; click, then the wheel to come nearer; a double click goes back. Red: colliding triangles
+<p class="note">The worst frame has the most vertices inside and intersecting pairs of triangles after collision
+handling; of those with equally many, or none, the one with the deepest vertex, then with the most pairs before.
+Drag to turn; click, then the wheel to come nearer; a double click goes back. Red: colliding triangles
 and vertices inside the body.</p>
 <h2>Penetration over time</h2>
 <div class="wide"><img class="plot" src="penetration.svg" alt="penetration over time"></div>

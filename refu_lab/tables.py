@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 from dataclasses import dataclass
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from refu_core._files import replacing
@@ -106,8 +107,8 @@ def _write(path: Path, text: str) -> None:
 
 def replay_table(result: ReplayResult) -> str:
     """What `refu replay` prints."""
-    rows = replay_rows(result.as_dict()["garments"])
-    table = ["", format_table(REPLAY_HEADER, rows), ""] if rows else []
+    header, rows = replay_columns(result.as_dict()["garments"])
+    table = ["", format_table(header, rows), "", fill(meanings(header), 120), ""] if rows else []
     lines = [f"{result.options.input}: {result.source}", *table]
     lines += [] if rows else [f"{len(result.latencies_ms)} frames, not evaluated"]
     whole = result.latency_ms()
@@ -128,17 +129,37 @@ def replay_table(result: ReplayResult) -> str:
     return "\n".join(lines)
 
 
-REPLAY_HEADER = (
+_HEADER = (
     *("garment", "frames", "p50 ms", "p95 ms", "p99 ms", "VFCP %", "CFMP %", "depth mm", "MPVE mm"),
     *("folds", "CFMP % on the skin"),
 )
+_MEANINGS = {
+    "p50 ms": "p50: median time of a frame",
+    "VFCP %": "VFCP: vertices inside the body, before → after collision handling",
+    "CFMP %": "CFMP: frames free of collisions",
+    "depth mm": "depth: of the deepest vertex",
+    "MPVE mm": "MPVE: mean distance to the true garment",
+    "folds": "folds: energy over the true garment's, from the finest to the widest",
+    "CFMP % on the skin": "on the skin: against the body as posed, with its overlaps",
+}
 _FIGURES = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
 
 _FOLDS = ("folds_1", "folds_4", "folds_16", "folds_64")
 
 
-def replay_rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """One row for each garment of a replay's JSON."""
+def meanings(header: Sequence[str]) -> str:
+    """What the columns of a replay's table say."""
+    return "; ".join(text for column, text in _MEANINGS.items() if column in header)
+
+
+def replay_columns(garments: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """The header, and a row for each garment of a replay's JSON, without the columns that no row has a value for."""
+    rows = _rows(garments)
+    shown = [i for i, column in enumerate(zip(*rows, strict=True)) if set(column) != {"-"}]
+    return [_HEADER[i] for i in shown], [[row[i] for i in shown] for row in rows]
+
+
+def _rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
     rows = []
     for name, after in garments.items():
         latency = [f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99")]

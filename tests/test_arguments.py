@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -226,6 +227,85 @@ def test_an_extra_that_is_missing_is_named(package: str, extra: str, arguments: 
     assert done.returncode == 2
     assert done.stderr == f'refu: error: {package} is not installed: pip install "refu-ros[{extra}]"\n'
     assert not any(tmp_path.iterdir())
+
+
+REFU = [sys.executable, "-m", "refu_lab"]
+
+
+@pytest.mark.parametrize("buffered", [True, False], ids=["buffered", "at once"])
+@pytest.mark.parametrize("arguments", [["garment", "list"], ["--help"]], ids=" ".join)
+def test_whose_reader_has_gone_ends_quietly(arguments: list[str], *, buffered: bool) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    environment = os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"}
+    done = subprocess.run([*REFU, *arguments], env=environment, stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert (done.returncode in (0, cli.EXIT_UNREAD), done.stderr) == (True, b"")
+
+
+def test_output_that_cannot_be_written_is_one_line() -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    with Path("/dev/full").open("w") as full:
+        command = [*REFU, "garment", "list"]
+        done = subprocess.run(command, env=environment, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, "refu: error: [Errno 28] No space left on device\n")
+
+
+def test_a_terminal_without_arrows_gets_the_rest() -> None:
+    options = [
+        "--max-frames",
+        "1",
+        "--garments",
+        "short-pant-male",
+        "--backbone",
+        "skinned",
+        "--sdf",
+        "none",
+        "--quiet",
+    ]
+    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run([*REFU, "replay", BAG, *options], env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"before ? after collision handling" in b" ".join(done.stdout.split())
+
+
+def test_an_interrupt_while_imports_run_leaves_no_traceback() -> None:
+    """Delivered when NumPy is being imported: as early as anybody can press Ctrl-C."""
+    code = (
+        "import os, signal, sys\n"
+        "class Interrupts:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'numpy': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Interrupts())\n"
+        "from refu_lab.__main__ import main\n"
+        "sys.exit(main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, b"", b"")
+
+
+@pytest.mark.parametrize("arguments", [[], ["garment"]], ids=["refu", "refu garment"])
+def test_a_command_without_its_subcommand_shows_its_help(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err.split()[:2]) == ("", ["usage:", "refu"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--garments", "a b"], "with commas between them, got 'a b'"),
+        (["--max-frames", "0"], "wanted a whole number above zero, got '0'"),
+        (["--max-frames", "9999999999"], "wanted a whole number from 1 to 1,000,000,000"),
+        (["--output", "w.db3"], "bags are written as NAME.mcap, or as a folder"),
+        (["--output", "w.bag"], "bags are written as NAME.mcap, or as a folder"),
+        (["--output", "W.MCAP"], "bags are written as NAME.mcap, or as a folder"),
+    ],
+)
+def test_values_say_what_was_wanted(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert said in refused(["replay", BAG, *arguments], capsys)
 
 
 @pytest.mark.parametrize(

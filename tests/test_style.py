@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -52,12 +53,27 @@ CORE = (
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 
 
+PAGES = ("README.md", *(f"docs/guide/{name}.md" for name in ("python", "garments", "outputs")))
+"""Those whose Python runs from top to bottom."""
+
+
+def programs_of_pages(to: Path) -> Iterator[Path]:
+    """What each page shows in Python, as one program a page."""
+    for page in map(ROOT.joinpath, PAGES):
+        blocks = re.findall(r"^```python\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        program = to / f"page_{page.stem.lower()}.py"
+        program.write_text("\n".join(blocks), encoding="utf-8")
+        yield program
+
+
 @pytest.mark.parametrize("command", [["ruff", "format", "--check"], ["ruff", "check"], ["mypy"]], ids=" ".join)
-def test_tools_are_silent(command: list[str]) -> None:
+def test_tools_are_silent(command: list[str], tmp_path: Path) -> None:
     if importlib.util.find_spec(command[0]) is None:
         pytest.skip(f"{command[0]} isn't installed (extra dev)")
-    if command == ["mypy"] and sys.version_info < (3, 11):
-        pytest.skip("numpy's last release for Python 3.10 lacks types that later ones have")
+    if command == ["mypy"]:
+        if sys.version_info < (3, 11):
+            pytest.skip("numpy's last release for Python 3.10 lacks types that later ones have")
+        command = [*command, *PACKAGES, "examples", *map(str, programs_of_pages(tmp_path))]
     done = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -139,6 +155,9 @@ FORBIDDEN = {
     "refu_lab.cli": {"torch", "warp", "rclpy"} | HEAVY,
     "refu_core.realtime": {"rclpy", "msg_adapters", "refu_core.metrics", "refu_core.simulation"} | HEAVY,
     "refu_core.metrics": {"rclpy", "msg_adapters"} | HEAVY,
+    "refu_core.training": {"rclpy", "msg_adapters", "numba"},
+    "refu_lab.benchmark": {"rclpy", "numba"},
+    "refu_lab.evaluate": {"rclpy", "numba"},
     "refu_lab.view": {"rclpy", "refu_ros"} | HEAVY,
 }
 """What a package must not pull in; those that may import torch are the last."""

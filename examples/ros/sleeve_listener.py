@@ -23,7 +23,7 @@ AHEAD_M = 0.15
 """How far in front of the opening the gripper waits, along its normal [m]."""
 
 
-class SleeveListener(Node):
+class SleeveListener(Node):  # type: ignore[misc]
     """Publishes where a gripper should wait, and says how close the cloth is to the skin."""
 
     def __init__(self) -> None:

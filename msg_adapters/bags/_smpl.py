@@ -29,6 +29,10 @@ class FrameRecord:
     raw: bytes
     """The message as it was, in CDR."""
 
+    def __repr__(self) -> str:
+        content = self.frame or self.error or f"{len(self.raw)} bytes"
+        return f"FrameRecord({self.topic} at {self.stamp_ns} ns: {content!r})"
+
 
 @dataclass(frozen=True, eq=False)
 class SmplBag:

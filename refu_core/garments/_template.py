@@ -62,6 +62,9 @@ class GarmentTemplate:
     uv: UvMap | None = None
     """Texture coordinates; None for a garment without them."""
 
+    def __repr__(self) -> str:
+        return f"GarmentTemplate({self.name} on {self.body}, {self.n_vertices} vertices, {len(self.faces)} faces)"
+
     @property
     def n_vertices(self) -> int:
         """Number of vertices V."""

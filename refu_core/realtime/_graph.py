@@ -27,7 +27,7 @@ class CudaCapture:
 
     def __init__(self, run: Callable[[], Tensor], device: torch.device) -> None:
         """Calls `run` a few times, then captures it. Raises `RuntimeError` if it can't be captured."""
-        here, stream = torch.cuda.current_stream(device), torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        here, stream = torch.cuda.current_stream(device), torch.cuda.Stream(device)
         stream.wait_stream(here)
         with torch.cuda.stream(stream):
             for _ in range(_WARM_UPS):

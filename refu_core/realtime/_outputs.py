@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,6 +82,11 @@ class FrameStats:
     shift: SkinShift = field(default_factory=SkinShift)
     """How far the collider is from the skin; zeros without one."""
 
+    def __repr__(self) -> str:
+        counts = (f"{name}: {one.n_inside} inside, {one.n_unresolved} left" for name, one in self.garments.items())
+        certified = "certified" if self.is_certified else "not certified"
+        return f"FrameStats({'; '.join((f'{sum(self.stage_ms.values()):.1f} ms', *counts, certified))})"
+
 
 @dataclass(frozen=True, eq=False)
 class GarmentMesh:
@@ -101,10 +106,12 @@ class GarmentMesh:
         """Vertices before collision handling, without the translation [m], shape (V, 3)."""
         return self.before()
 
-    @property
+    @cached_property
     def vertices(self) -> NDArray[np.float64]:
         """Vertices with the translation [m], shape (V, 3); added in float64, so that distant bodies stay precise."""
-        return self.local + self.transl
+        placed = self.local + self.transl
+        placed.flags.writeable = False  # what is written would be seen by whoever asks next
+        return placed
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles have all arrays made."""

@@ -61,12 +61,17 @@ class GarmentPipeline:
 
     def __init__(
         self,
-        steps: Sequence[FrameStep],
+        steps: Sequence[FrameStep] = (),
         *,
-        margin: float | None,
-        style: Tensor | None,
+        margin: float | None = None,
+        style: Tensor | None = None,
         graph: bool = True,
     ) -> None:
+        """What `load` calls. Raises `RefuError` for anything but its steps."""
+        given: object = steps
+        if not isinstance(given, Sequence) or not given or not all(isinstance(one, FrameStep) for one in given):
+            msg = "a pipeline isn't made of names: GarmentPipeline.load(['tshirt-male']) loads the garments, too"
+            raise RefuError(msg)
         self._steps = steps
         self.outfit = outfit = steps[0].outfit
         """The body model, the garments and their networks."""
@@ -217,8 +222,8 @@ class GarmentPipeline:
             require_type(frames, Sequence, "a SmplFrame or a sequence of them", error=FrameError)
             for one in frames:
                 require_type(one, SmplFrame, "a SmplFrame in every place of the sequence", error=FrameError)
-        _check_margin(margin)
         margin = self.margin if margin is None else margin
+        _check_margin(margin)
         with self._crew.turn() as step:
             if isinstance(frames, SmplFrame):
                 return self._dress_all(step, [frames], margin)[0]

@@ -1,4 +1,7 @@
-"""One garment on one moving body: the state of the cloth, its contacts, and a frame of simulated time."""
+"""One garment on one moving body: the state of the cloth, its contacts, and a frame of simulated time.
+
+Loops in Numba are imported where they are called: settings and data sets are read where it isn't installed, too.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,6 @@ from numpy.typing import NDArray
 from refu_core.mesh import vertex_areas
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._mesh import ClothTopology
-from refu_core.simulation._pairs import find_candidates, near_pairs
-from refu_core.simulation._solver import refresh_points, substep
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -185,6 +186,8 @@ class SimulatedCloth:
         Returns:
             Root mean square speed of the vertices at the end [m/s].
         """
+        from refu_core.simulation._solver import substep
+
         s = self.settings
         moving = body_from is not body_to
         refresh = s.refresh if moving or careful else s.substeps
@@ -213,6 +216,8 @@ class SimulatedCloth:
 
     def _pairs(self) -> tuple[I32, I32, F32]:
         """Vertices near a face that they aren't near in the rest shape, the face, and the vertex's side of it."""
+        from refu_core.simulation._pairs import find_candidates, near_pairs
+
         faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
         if float(np.sqrt(_squared_way(self.positions, self._searched_at).max())) > _PAIR_SLACK / 2:
             self._candidates = find_candidates(
@@ -240,6 +245,8 @@ class SimulatedCloth:
 
     def _touch(self, skin: _Skin, points: F32, stale: I32, body: F32, motion: F32 | None) -> _Contacts:
         """Contacts of `points` (N, 3) with the body (V, 3), whose distance field is queried for the `stale` ones."""
+        from refu_core.simulation._solver import refresh_points
+
         if len(stale):
             asked = points[stale]
             self._sdf.update(torch.from_numpy(body))

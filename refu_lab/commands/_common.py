@@ -7,6 +7,7 @@ import math
 import os
 import re
 import stat
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -24,6 +25,8 @@ EXIT_CHECK_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_BUG = 70
 EXIT_INTERRUPTED = 130
+EXIT_UNREAD = 141
+"""Nobody reads the output any more: what a shell says of a program that SIGPIPE has ended."""
 _MOST = 10**9
 
 
@@ -39,11 +42,22 @@ class Parser(argparse.ArgumentParser):
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
 
 
+def add_subcommands(parser: argparse.ArgumentParser, *, metavar: str) -> Any:
+    """Adds subcommands to a parser, which prints its help if none is given."""
+
+    def run(_args: argparse.Namespace) -> int:
+        parser.print_help(sys.stderr)
+        return EXIT_BAD_INPUT
+
+    parser.set_defaults(run=run)
+    return parser.add_subparsers(dest=metavar.lower(), metavar=metavar, parser_class=Parser)
+
+
 def names(text: str) -> tuple[str, ...]:
-    """Parses `A,B`: at least one name."""
+    """Parses `A,B`: at least one name; spaces are only in paths of garments."""
     found = tuple(name.strip() for name in text.split(",") if name.strip())
-    if not found:
-        msg = "wanted one name or several with commas between them"
+    if not found or any(len(name.split()) > 1 and not name.endswith(".npz") for name in found):
+        msg = f"wanted one name or several with commas between them, got {printable(repr(text))}"
         raise argparse.ArgumentTypeError(msg)
     return found
 
@@ -90,7 +104,9 @@ def _number(kind: type[Number], text: str, low: float, high: float) -> Number:
     except ValueError:
         number = None
     if number is None or not low <= number <= high:
-        bounds = f"above zero, at most {high:g}" if (kind, low) == (int, 1) else f"from {low:g} to {high:g}"
+        bounds = f"from {low:g} to {high:,}"
+        if high == _MOST and (number is None or number < low):  # nobody has to hear of the largest
+            bounds = "above zero" if low else "of zero or more"
         msg = f"wanted a {'whole ' if kind is int else ''}number {bounds}, got {printable(repr(text))}"
         raise argparse.ArgumentTypeError(msg)
     return number
@@ -128,7 +144,11 @@ def out_folder(text: str) -> Path:
 
 
 def out_bag(text: str) -> Path:
-    """The path of a bag to write, a file or a folder."""
+    """The path of a bag to write, a file or a folder; a new folder isn't named like a file of another kind."""
+    path = in_path(text)
+    if (path.suffix[1:].isalpha() or path.suffix == ".db3") and path.suffix != ".mcap" and not path.is_dir():
+        msg = f"bags are written as NAME.mcap, or as a folder, whose name has no {path.suffix}; got {printable(text)}"
+        raise argparse.ArgumentTypeError(msg)
     return _output(text, "a file or a folder", lambda mode: stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 

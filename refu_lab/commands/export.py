@@ -25,6 +25,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--first", type=cli.seed, default=0, metavar="N", help="number of the first frame (0)")
     parser.add_argument("--count", type=cli.positive, default=1, metavar="N", help="how many frames (1)")
     parser.add_argument("--no-body", dest="with_body", action="store_false", help="the garments alone")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     cli.add_options(parser, RecordingOptions)
     cli.add_common(parser, run)
 
@@ -33,7 +34,8 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.export import export
 
     options = RecordingOptions(**cli.given(args, RecordingOptions))
-    written, warnings = export(options, args.output, first=args.first, count=args.count, with_body=args.with_body)
+    what = {"first": args.first, "count": args.count, "with_body": args.with_body, "overwrite": args.overwrite}
+    written, warnings = export(options, args.output, **what)
     lines = [f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in written]
     lines += [f"warning: {warning}" for warning in warnings]
     return cli.tell(args, "\n".join(lines), {"files": [str(path) for path in written], "warnings": warnings})

@@ -45,7 +45,7 @@ def add(commands: Any) -> None:
         help="add a garment of your own, or list all garments",
         description="Garments are files. Some ship; yours are in a folder, and anywhere by their path.",
     )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = cli.add_subcommands(parser, metavar="ACTION")
     adding = actions.add_parser(
         "add",
         help="make a garment of a mesh",

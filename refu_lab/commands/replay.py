@@ -157,6 +157,8 @@ def _replay_many(args: argparse.Namespace) -> int:
     with open_engine(args.jobs, args.scheduler) as engine:
         result = replay_fleet(recordings, options, engine=engine, progress=not args.quiet)
     cli.tell(args, fleet_table(result), result.as_dict())
+    if args.output is not None and len(result.failed) < len(result.rows):
+        print(f"bags: {args.output.rstrip('/')}/NAME.mcap")
     if args.report is not None:
         print(f"report: {args.report.rstrip('/')}/index.html")
     return cli.EXIT_INTERRUPTED if result.interrupted else cli.EXIT_BAD_INPUT if result.failed else 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
         msg = "--postures are for poses at rest: leave --sequences out"
         raise RefuError(msg)
     cli.require_use(args, {"shapes": "sequences", "seconds": "sequences", "input_axes": "motions", "fps": "motions"})
+    if find_spec("numba") is None:  # said before the work begins, which imports it
+        raise ModuleNotFoundError(name="numba")
     with open_engine(args.jobs, args.scheduler) as engine:
         options = SimulateOptions(**cli.given(args, SimulateOptions))
         card = simulate(options, engine=engine, progress=not args.quiet)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from textwrap import fill
 from typing import Any
 from urllib.parse import quote
 
-from refu_lab.tables import REPLAY_HEADER, REPLAY_TITLE, format_table, html_page, html_table, replay_rows
+from refu_lab.tables import REPLAY_TITLE, format_table, html_page, html_table, meanings, replay_columns
 
 _HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
 _WORST_HEADER = ("recording", "frame", "time s", "inside", "pairs", "depth mm")
@@ -76,9 +77,8 @@ class FleetResult:
         """The page about all recordings, `index.html` in the folder of the reports."""
         from refu_lab.report import STYLE
 
-        garments = html_table(
-            REPLAY_HEADER, [[html.escape(cell) for cell in row] for row in replay_rows(self.garments())]
-        )
+        header, rows = replay_columns(self.garments())
+        garments = html_table(header, [[html.escape(cell) for cell in row] for row in rows])
         recordings = [[self._link(row), *(html.escape(cell) for cell in _cells(row)[1:])] for row in self.rows]
         worst = [
             [self._link(frame), *(html.escape(cell) for cell in _worst_cells(frame)[1:])] for frame in self.worst()
@@ -88,7 +88,7 @@ class FleetResult:
         warned = "".join(f'<p class="warn">{html.escape(warning)}</p>' for warning in self.warnings())
         body = f"""<p class="note">{frames} frames; {len(self.failed)} recordings couldn't be replayed{left}.</p>
 {warned}
-<h2>Garments, over all frames</h2>{garments}
+<h2>Garments, over all frames</h2>{garments}<p class="note">{meanings(header)}.</p>
 <h2>Recordings</h2>{html_table(_HEADER, recordings)}
 <p class="note">Free: frames in which no garment has a vertex inside the body or a triangle that cuts it.</p>
 <h2>Worst frames of all</h2>{html_table(_WORST_HEADER, worst)}"""
@@ -102,8 +102,10 @@ class FleetResult:
 def fleet_table(result: FleetResult) -> str:
     """What `refu replay` prints for several recordings."""
     lines = [format_table(_HEADER, [_cells(row) for row in result.rows])] if result.rows else []
-    if garments := replay_rows(result.garments()):
-        lines += ["", format_table(REPLAY_HEADER, garments)]
+    if garments := result.garments():
+        header, rows = replay_columns(garments)
+        said = f"{meanings(header)}; free: frames in which no garment collides"
+        lines += ["", format_table(header, rows), "", fill(said, 120)]
     if worst := [_worst_cells(frame) for frame in result.worst() if frame["n_inside"] or frame["n_pairs"]]:
         lines += ["", "worst frames", format_table(_WORST_HEADER, worst)]
     done, kept = len(result.rows) - len(result.failed), sum(bool(row.get("kept")) for row in result.rows)

@@ -122,10 +122,11 @@ def test_nobody_can_write_in_what_others_get(pipeline: GarmentPipeline) -> None:
     frame = SmplFrame(pose=np.zeros((24, 3)))
     for out in (pipeline(frame), *pipeline([frame, frame])):
         mesh = next(iter(out.values()))
-        for array in (mesh.local, mesh.raw, mesh.faces, out.body, out.skin):
+        for array in (mesh.local, mesh.raw, mesh.faces, mesh.vertices, out.body, out.skin):
             with pytest.raises(ValueError, match="read-only"):
                 array[0] = 1
-        mesh.vertices[0] = 1  # is made anew each time
+        assert mesh.vertices is mesh.vertices
+        np.testing.assert_array_equal(mesh.vertices, mesh.local + mesh.transl)
 
 
 def test_a_style_beyond_the_promise_is_not_promised() -> None:
@@ -363,14 +364,15 @@ def test_what_a_newcomer_types_answers_in_a_line(pipeline: GarmentPipeline) -> N
     with pytest.raises(KeyError, match="no garment 'tshirt': this person wears"):
         output["tshirt"]
     assert "tshirt" not in output
-    for shown in (pipeline, output, next(iter(output.values()))):
-        assert len(repr(shown).splitlines()) == 1
-        assert len(repr(shown)) < 200
+    shown = (pipeline, output, next(iter(output.values())), output.stats, pipeline.outfit, *pipeline.garments.values())
+    for one in (*shown, SmplFrame(pose=np.zeros((24, 3)), transl=np.full(3, 1 / 3))):
+        assert len(repr(one).splitlines()) == 1
+        assert len(repr(one)) < 200
 
 
 def test_copies_of_a_frame_are_as_safe_as_it_is() -> None:
     frame = SmplFrame(pose=np.ones(72, np.float16), betas=range(10), transl=np.zeros(3, np.longdouble))
-    for other in (pickle.loads(pickle.dumps(frame)), copy.copy(frame), copy.deepcopy(frame)):
+    for other in (pickle.loads(pickle.dumps(frame)), copy.copy(frame), copy.deepcopy(frame), replace(frame)):
         np.testing.assert_array_equal(other.pose, frame.pose)
         for array in (other.pose, other.betas, other.transl):
             with pytest.raises(ValueError, match="read-only"):

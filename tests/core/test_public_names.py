@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pydoc
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +27,16 @@ def test_dir_and_star_show_all_public_names() -> None:
     names: dict[str, Any] = {}
     exec("from refu_core import *", names)
     assert set(refu_core.__all__) <= set(names)
+
+
+def test_packages_are_attributes_and_nothing_else_is_shown() -> None:
+    """In an interpreter that has imported nothing but `refu_core`."""
+    code = "import refu_core; print(*dir(refu_core)); refu_core.outputs.Clearance, refu_core.skeleton.JOINT_NAMES"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    names = {name for name in shown.split() if not name.startswith("__")}
+    assert {"outputs", "simulation", "skeleton"} <= names
+    assert not names & {"Any", "TYPE_CHECKING", "import_module", "annotations"}
+    assert not any(name.startswith("_") for name in names)
 
 
 def test_help_shows_all_public_names() -> None:
@@ -75,12 +87,16 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
         (lambda: pipeline()([FRAME, np.zeros(72)]), "wanted a SmplFrame in every place .*, got ndarray"),
         (lambda: pipeline()({"pose": 0}), "wanted a SmplFrame or a sequence of them, got dict"),
         (lambda: GarmentPipeline.load(5), "wanted names of garments, got int"),
+        *(
+            (lambda given=given: GarmentPipeline(*given), r"GarmentPipeline\.load\(\['tshirt-male'\]\) loads")
+            for given in ((), (["tshirt-male"],), ("tshirt-male",), (5,))
+        ),
         (
             lambda: GarmentPipeline.load(["short-pant-male"], margin="4 mm"),
             "wanted a margin in metres, or None, got str",
         ),
         (lambda: GarmentPipeline.load(["short-pant-male"], style="slim"), r"style must be \(4,\) numbers, got str"),
-        (lambda: setattr(pipeline(), "margin", -1.0), "the margin must be between 0 and 0.05 m, got -1.0"),
+        (lambda: pipeline()(FRAME, margin=-1.0), "the margin must be between 0 and 0.05 m, got -1.0"),
         (lambda: load_body(5), "wanted a body's name or path, got int"),
         (lambda: load_body("male")(pose="standing"), "pose must be an array or tensor of numbers, got str"),
         (lambda: SmplFrame(pose="standing"), "pose must be .* numbers, got str"),

@@ -232,7 +232,9 @@ def test_results_by_url_are_those_by_path(bags: Path, tmp_path: Path, capsys: An
     assert run(bags / "a", "--output", tmp_path / "by-path", "--no-evaluate") == 0
     assert run(*arguments) == 0
     assert run(*arguments) == 0
-    assert "2 of 2 recordings replayed, 2 of them before" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "2 of 2 recordings replayed, 2 of them before" in said
+    assert "NAME.mcap" in said
     for name in ("walk", "turn"):
         by_url, by_path = ((tmp_path / folder / f"{name}.mcap").read_bytes() for folder in ("out", "by-path"))
         is_same = by_url == by_path  # pytest would look for all differences of a million bytes

@@ -291,7 +291,8 @@ def test_frames_of_a_bag_are_exported(tmp_path: Path, capsys) -> None:
     assert set(trimesh.load_scene(out).geometry) == {"body", "short-pant-male"}
     assert main(["export", str(WALK), "--output", str(tmp_path / "walk.stl")]) == 2
     assert "wanted a file of .glb, .obj" in capsys.readouterr().err
-    assert main(["export", str(WALK), "--output", str(out), "--first", "100000"]) == 2
+    later = str(tmp_path / "later.glb")
+    assert main(["export", str(WALK), "--output", later, "--first", "100000"]) == 2
     assert "has no frame that can be dressed" in capsys.readouterr().err
 
 
@@ -311,9 +312,28 @@ def test_frames_that_a_recording_has_not_are_said(tmp_path: Path, capsys) -> Non
     assert "warning: it has 3 frames, wanted number 2 to 3" in capsys.readouterr().out
 
 
+def test_an_export_replaces_nothing_unasked(tmp_path: Path, capsys) -> None:
+    """Of several files, one that is there is enough, and the others aren't begun."""
+    plain = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider"]
+    arguments = ["export", str(WALK), "--output", str(tmp_path / "a.obj"), "--count", "2", *plain]
+    (tmp_path / "a_1.obj").write_text("precious")
+    assert main(arguments) == 2
+    assert "a_1.obj is there already" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["a_1.obj"]
+    assert main([*arguments, "--overwrite"]) == 0
+    assert (tmp_path / "a_1.obj").read_text() != "precious"
+    np.savez(tmp_path / "a.npz", poses=np.zeros((1, 72)), trans=np.zeros((1, 3)), fps=30.0)
+    (tmp_path / "a.obj").write_text("precious")  # one frame is left of three: this file
+    arguments = ["export", str(tmp_path / "a.npz"), "--output", str(tmp_path / "a.obj"), "--count", "3", *plain]
+    (tmp_path / "a_1.obj").unlink()
+    (tmp_path / "a_0.obj").unlink()
+    assert main(arguments) == 2
+    assert (tmp_path / "a.obj").read_text() == "precious"
+
+
 def test_an_export_takes_the_options_of_a_replay(tmp_path: Path, capsys) -> None:
     """Another shape, another body and others' axes change what is written; foreign betas are said."""
-    common = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider"]
+    common = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider", "--overwrite"]
 
     def exported(source: Path, *options: str) -> dict[str, np.ndarray]:
         out = tmp_path / "out.glb"

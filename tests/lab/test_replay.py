@@ -213,14 +213,19 @@ def sampled(motions: list[Path]) -> list[SmplFrame]:
 
 
 @pytest.mark.usefixtures("little_light")
-def test_report_is_complete_in_its_folder(small_bag: Path, tmp_path: Path) -> None:
+def test_report_is_complete_in_its_folder(small_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(small_bag, "--report", tmp_path / "report", "--garments", "short-pant-male") == 0
+    told = capsys.readouterr().out
+    assert "CFMP: frames free of collisions" in " ".join(told.split())
+    assert "MPVE" not in told, "there is no true garment"
     page = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
     files = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert len(files) == 8, "two plots, three frames before and after"
     for file in files:
         assert (tmp_path / "report" / file).stat().st_size > 1000
     assert "short-pant-male" in page
+    assert "p50: median" in page
+    assert "MPVE" not in page
 
 
 def test_betas_can_be_given(small_bag: Path, tmp_path: Path) -> None:
