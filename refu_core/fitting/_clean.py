@@ -64,6 +64,17 @@ def rim_vertices(f: Ints) -> Ints:
     return np.unique(Connectivity.of(f).boundary).astype(np.int64)
 
 
+def is_ball(f: Ints) -> bool:
+    """Whether the largest piece is closed and no hole goes through it: no limb can. Cloth with two sides has holes."""
+    used, f = np.unique(f, return_inverse=True)
+    f = f.reshape(-1, 3)
+    _, label = components(f, len(used))
+    largest = int(np.bincount(label).argmax())
+    f = f[label[f[:, 0]] == largest]
+    euler = int((label == largest).sum()) - len(_edges(f)[0]) + len(f)
+    return euler == 2
+
+
 def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
     """The same surface with edges of at most `longest`: long ones are halved until none is left."""
     while True:

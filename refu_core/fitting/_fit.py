@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -11,10 +12,18 @@ from numpy.typing import NDArray
 
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError, require_type
-from refu_core.fitting._clean import MAX_VERTICES, clean, components, face_normals, split_long_edges, turned_over
+from refu_core.fitting._clean import (
+    MAX_VERTICES,
+    clean,
+    components,
+    face_normals,
+    is_ball,
+    split_long_edges,
+    turned_over,
+)
 from refu_core.fitting._mesh_file import SurfaceMesh
-from refu_core.fitting._pieces import apart, unsewn, without_bodies
-from refu_core.fitting._place import NO_OPENING, Place, Placing, find_places
+from refu_core.fitting._pieces import apart, unsewn, without_bodies, without_floor
+from refu_core.fitting._place import NO_OPENING, UNITS, Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -40,7 +49,8 @@ _DEEP, _MOST_DEEP = 0.03, 0.04
 another body or pose."""
 _FARTHEST, _MOST_FAR = 0.06, 0.003
 """If more than a share `_MOST_FAR` of the vertices has to move farther than `_FARTHEST` [m] to be outside the body, a
-limb went through the cloth. A few may have to: between toes or fingers there is no room for cloth."""
+limb went through the cloth. A few may have to, by twice as much at most: between toes or fingers there is no room for
+cloth."""
 _STRETCHED, _MOST_STRETCHED = 2.0, 0.02
 """When cloth is brought into the T-pose, at most a share `_MOST_STRETCHED` of its edges should become more than
 `_STRETCHED` times as long; in sleeves from an A-pose, those under the arms do."""
@@ -53,6 +63,8 @@ _SHOULDERS = tuple(
 _ROUNDS = 20
 _MOST_PIECES = 1000
 """A coat with its buttons has some dozens; loose triangles that nearly touch are thousands, and take minutes."""
+_AS_TALL = 0.01
+"""A wearer whose height is within this share of the body's is as tall: his clothes keep their unit."""
 _FLAT = 0.99
 """A mesh is laid out flat if more than this share of it faces along one line; a garment has two thirds at most."""
 
@@ -119,12 +131,14 @@ def fit_garment(
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
         raise GarmentError(msg)
+    cleaned, floors = without_floor(cleaned)
+    notes += floors
     _require_worn(cleaned)
     faults: list[GarmentError] = []
     makeshift: _Worn | None = None
-    for place in find_places(cleaned, body, replace(placing or Placing(), held_at=details.held_at)):
+    for clothes, place in _places(cleaned, body, replace(placing or Placing(), held_at=details.held_at)):
         try:
-            worn = _put_on(cleaned, place, body, longest_edge)
+            worn = _put_on(clothes, place, body, longest_edge)
         except GarmentError as error:  # a limb goes through it there: is there another place?
             faults.append(error)
             continue
@@ -135,6 +149,27 @@ def fit_garment(
     if makeshift is None:
         raise faults[0]  # `find_places` finds a place, or raises
     return _bound(makeshift, body, name, details, notes)
+
+
+def _places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator[tuple[SurfaceMesh, Place]]:
+    """The mesh without its wearer, and where it may belong, as `find_places` finds it.
+
+    Clothes are as large for the body as they were for him: together, they would be made to fit his skin, not his size.
+    """
+    for place in find_places(mesh, body, placing):
+        posed = PosedBody(body, place.pose)
+        clothes, notes, height = without_bodies(mesh, place(mesh.vertices), posed)
+        if notes:
+            unit = place.unit * float(np.ptp(posed.vertices[:, 1].numpy())) / height
+            near = min(UNITS.values(), key=lambda known: abs(np.log(known / unit)))
+            if abs(np.log(near / unit)) < _AS_TALL:
+                unit = near
+            elif placing.unit is None:
+                notes.append("its clothes were scaled with it to the body's height")
+            for there in find_places(clothes, body, replace(placing, unit=placing.unit or unit)):
+                yield clothes, replace(there, notes=[*notes, *there.notes])
+            return
+        yield mesh, place
 
 
 def _require_worn(mesh: SurfaceMesh) -> None:
@@ -164,8 +199,12 @@ class _Worn(NamedTuple):
 def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float) -> _Worn:
     """The mesh on the body at some place; raises `GarmentError` where it can't be there."""
     posed = PosedBody(body, place.pose)
-    mesh, bodies = without_bodies(replace(mesh, vertices=place(mesh.vertices)), posed)
-    notes, warnings = [*place.notes, *bodies, *apart(mesh), *unsewn(mesh)], []
+    mesh = replace(mesh, vertices=place(mesh.vertices))
+    notes, warnings = [*place.notes, *apart(mesh), *unsewn(mesh)], []
+    fit = place.fit
+    if not (fit.is_good or fit.is_ring or fit.is_tight):
+        where = f"{1e3 * fit.distance:.0f} mm off, {100 * fit.facing:.0f} % faces outward"
+        warnings.append(f"it hardly surrounds the body ({where}): look at it (--picture)")
     n = len(mesh.vertices)
     mesh = split_long_edges(mesh, longest_edge)
     if len(mesh.vertices) > n:
@@ -287,7 +326,7 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             f"{100 * deep:.0f} % of the garment is more than {1e3 * _DEEP:.0f} mm inside the body {body.body.name}, "
             f"most of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
         )
-        msg += "" if len(connectivity.boundary) else NO_OPENING
+        msg += NO_OPENING if is_ball(mesh.faces) else ""
         raise GarmentError(msg)
     for _ in range(_ROUNDS):
         lift = _shortfall(v, body)
@@ -301,12 +340,13 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             break
         v = v + _larger(lift, 0.9 * (adjacent @ lift) / degree)
     moved = np.linalg.norm(v - start, axis=1)
-    if (moved > _FARTHEST).mean() > _MOST_FAR:
+    if (moved > _FARTHEST).mean() > _MOST_FAR or moved.max() > 2 * _FARTHEST:
         near = _near(v[moved > _FARTHEST], body)
         msg = (
             f"to be outside the body {body.body.name} the garment had to move by {1e3 * moved.max():.0f} mm near the "
             f"{near}: it was made for another body or pose; say its --pose or --up, or try another --body"
         )
+        msg += NO_OPENING if is_ball(mesh.faces) else ""
         raise GarmentError(msg)
     if moved.max() > 1e-3:
         notes.append(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -11,6 +13,7 @@ from refu_core.errors import GarmentError
 from refu_core.fitting._clean import components, face_normals, rim_vertices
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
+from refu_core.fitting._surround import sample
 from refu_core.frames import N_JOINTS
 
 F64 = NDArray[np.float64]
@@ -19,6 +22,12 @@ Ints = NDArray[np.int64]
 _ENDS = tuple(JOINT_NAMES.index(name) for name in ("head", "left_hand", "right_hand", "left_foot", "right_foot"))
 _ON_SKIN = 0.02
 """At least half of a body lies nearer than this to the skin [m]; of an overall with hood and gloves, less does."""
+_EYE = 0.1
+"""Eyes, teeth and brows are smaller than this [m]; a sock is larger."""
+_N_NEAR = 5000
+"""Points drawn on a wearer and on clothes, 2 cm from each other: a button is nearer to its cloth than the skin is."""
+_SLAB = 0.1
+"""A floor is thinner than this share of its width, and what stands on it is not."""
 _SEAM = 0.01
 """Rims of two pieces nearer to each other than this were meant to be sewn [m]: panels are laid out that way."""
 _SHARE = 0.1
@@ -29,29 +38,66 @@ _BETWEEN = 0.02
 """Parts farther than this from each other [m] along the body are two garments."""
 
 
-def without_bodies(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, list[str]]:
-    """The mesh on a body, without pieces that are bodies themselves, and a note of each.
+def without_floor(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
+    """The mesh, in any unit and axes, without a slab that all the rest stands on or before, and a note of it."""
+    n_pieces, label = components(mesh.faces, len(mesh.vertices))
+    low, high = np.full((n_pieces, 3), np.inf), np.full((n_pieces, 3), -np.inf)
+    np.minimum.at(low, label, mesh.vertices)
+    np.maximum.at(high, label, mesh.vertices)
+    widest = int(np.prod(np.partition(high - low, 1, axis=1)[:, 1:], axis=1).argmax())
+    others = np.arange(n_pieces) != widest
+    if not others.any():
+        return mesh, []
+    rest_low, rest_high = low[others].min(0), high[others].max(0)
+    size, rest = high[widest] - low[widest], rest_high - rest_low
+    axis = int(size.argmin())
+    across = np.arange(3) != axis
+    is_thin = size[axis] < _SLAB * size[across].min() and rest[axis] > max(2 * size[axis], _SLAB * rest.max())
+    is_wider = ((low[widest] < rest_low) & (high[widest] > rest_high))[across].all()
+    middle = (low[widest] + high[widest])[axis] / 2
+    is_beside = not rest_low[axis] + rest[axis] / 4 < middle < rest_high[axis] - rest[axis] / 4
+    if not (is_thin and is_wider and is_beside):
+        return mesh, []
+    note = "a flat piece, wider than all the rest, was taken for a floor and left out"
+    return mesh.only(others[label[mesh.faces[:, 0]]]).compact(), [note]
+
+
+def without_bodies(mesh: SurfaceMesh, vertices: F64, posed: PosedBody) -> tuple[SurfaceMesh, list[str], float]:
+    """The mesh without pieces that are bodies themselves, a note of each, and their height; zero if there are none.
+
+    Its `vertices` (V, 3) are on a body [m], and so is the height.
 
     Characters come in one file with their clothes. A piece is a body if it has a head, hands and feet and lies on the
-    skin.
+    skin. Its eyes and teeth are small pieces that are nearer to it than to the clothes.
 
     Raises `GarmentError`: nothing else is left.
     """
-    n_pieces, label = components(mesh.faces, len(mesh.vertices))
+    n_pieces, label = components(mesh.faces, len(vertices))
     joint = posed.body.weights.argmax(1).numpy()[posed.body.faces[:, 0].numpy()]
     has = np.zeros((n_pieces, N_JOINTS), np.bool_)
-    has[label, joint[posed.closest(mesh.vertices)[0]]] = True
+    has[label, joint[posed.closest(vertices)[0]]] = True
     is_body = np.all(has[:, _ENDS], axis=1)
     for piece in np.flatnonzero(is_body):
-        is_body[piece] = np.median(np.abs(posed(mesh.vertices[label == piece])[0])) < _ON_SKIN
+        is_body[piece] = np.median(np.abs(posed(vertices[label == piece])[0])) < _ON_SKIN
     if not is_body.any():
-        return mesh, []
-    kept = ~is_body[label[mesh.faces[:, 0]]]
-    if not kept.any():
+        return mesh, [], 0.0
+    notes = ["a piece with head, hands and feet was taken for the wearer's body and left out"] * int(is_body.sum())
+    is_small = np.array([np.ptp(vertices[label == piece], axis=0).max() for piece in range(n_pieces)]) < _EYE
+    of_face = label[mesh.faces[:, 0]]
+    clothes = ~(is_body | is_small)[of_face]
+    if not clothes.any():
         msg = "it is a body with head, hands and feet, and no garment: wanted clothes (--body says who wears them)"
         raise GarmentError(msg)
-    note = "a piece with head, hands and feet was taken for the wearer's body and left out"
-    return mesh.only(kept).compact(), [note] * int(is_body.sum())
+    placed = replace(mesh, vertices=vertices)
+    skin, cloth = (cKDTree(sample(placed.only(f), _N_NEAR).points) for f in (is_body[of_face], clothes))
+    gone = is_body.copy()
+    for piece in np.flatnonzero(is_small & ~is_body):
+        points = vertices[label == piece]
+        gone[piece] = np.median(skin.query(points)[0]) < np.median(cloth.query(points)[0])
+    if n_eyes := int((gone & ~is_body).sum()):
+        notes.append(f"{n_eyes} small pieces nearer to it than to its clothes, as eyes are, were left out, too")
+    height = float(np.ptp(vertices[is_body[label], 1]))
+    return mesh.only(~gone[of_face]).compact(), notes, height
 
 
 def unsewn(mesh: SurfaceMesh) -> list[str]:

@@ -14,10 +14,11 @@ from scipy.optimize import minimize
 
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import face_normals, rim_vertices
+from refu_core.fitting._clean import is_ball
 from refu_core.fitting._mesh_file import SurfaceMesh
-from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_SHOULDER, PosedBody, standing_pose
+from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, parts_legs, sample
+from refu_core.fitting._turns import LYING, is_sideways_turn, turns_of
 from refu_core.frames import N_JOINTS
 
 F64 = NDArray[np.float64]
@@ -30,6 +31,15 @@ _SIZES = (0.12, 2.1)
 """The largest extent of a garment [m]: from a sock to a gown with a train."""
 _ARMS = (0.0, 0.35, 0.6, 0.85, 1.1)
 """How far arms may hang when a search begins [rad]: T-pose to arms nearly down."""
+_RARER = ((0.6, 0.1), (0.6, 0.25), (0.6, 0.45), (0.5, 0.0, 0.5), (0.9, 0.0, 0.5))
+"""Arms lowered, legs spread and elbows bent when the search begins again, because it found nothing plain [rad]."""
+_BENDS = tuple(itertools.product((0.0, 0.2, 0.5, 0.8, 1.1), (0.0, 0.3)))
+"""Elbows bent and arms brought forward when a search for them begins [rad]."""
+_REACH = np.array([(-0.2, 1.3), (0.0, 0.6), (0.0, 1.6), (-0.3, 0.6)]).T
+"""How far arms are lowered, legs spread, elbows bent, and arms brought forward at most [rad]."""
+_TOUCHES = 1e-4
+"""A mesh that lacks more than this [m] to be 1 cm off the skin, on average, is tried with bent elbows: of a loose shirt
+with sleeves, 0.002 mm with straight arms, and 0.3 mm if elbows were bent by 10°."""
 _N_POINTS = 400
 _TOLERANCE = 0.015
 """A mesh is taken as it is unless something else fits this much better, as a share of its size."""
@@ -45,10 +55,6 @@ _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 _NOTHING = 0.01
 """A mesh that fits has less than this share of it inside the body."""
 _N_REFINED = 2
-_ASKEW = np.radians(10)
-"""A garment stands askew if its breadth is turned farther than this from an axis [rad]."""
-_BROADER = 1.7
-"""A garment's breadth shows only if the variance along it is more than this many times that along its depth."""
 _OF_NO_UNIT = 1e-3
 """An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit."""
 
@@ -67,6 +73,11 @@ class Placing:
     """Whether the mesh's origin is the body's; otherwise it may be moved."""
     held_at: str | None = None
     """A garment that is held at the `waist` doesn't reach up between the arms."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is left to find out."""
+        return self.is_placed and None not in (self.unit, self.up) and self.pose is not None
 
     def __post_init__(self) -> None:
         """Raises `GarmentError` for what is no unit, no axis or no pose."""
@@ -97,6 +108,7 @@ class Place:
     kind: str
     """How it was placed: as it is (empty), moved from a `floor`, or `searched`."""
     notes: list[str] = field(default_factory=list)
+    """What was found out, one sentence each."""
 
     def is_like(self, other: Place) -> bool:
         """Whether it has the same unit and axes, and was placed in the same way."""
@@ -106,15 +118,15 @@ class Place:
     @property
     def is_sideways(self) -> bool:
         """Whether the mesh would have been modelled facing x, as nobody does."""
-        return _is_sideways(self.turn)
+        return is_sideways_turn(self.turn)
 
     def cost(self, extent: float) -> float:
         """The cost as a share of the garment's size; otherwise the smallest size would always be nearest to the skin.
 
-        What nobody does without need counts, too: modelling a garment sideways, with spread legs or hanging arms.
+        What nobody does without need counts, too: modelling a garment sideways, with spread legs, hanging or bent arms.
         """
-        arms, legs = self.pose[RIGHT_SHOULDER, 2], self.pose[LEFT_HIP, 2]
-        without_need = 0.02 * self.is_sideways + 0.1 * abs(legs) + 0.005 * abs(arms)
+        arms, legs = np.abs(self.pose[[RIGHT_SHOULDER, RIGHT_ELBOW], 1:]).sum(), abs(self.pose[LEFT_HIP, 2])
+        without_need = 0.02 * self.is_sideways + 0.1 * legs + 0.005 * arms
         return float(self.fit.cost / (self.unit * extent) + without_need)
 
     def __call__(self, vertices: F64) -> F64:
@@ -147,13 +159,16 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     search = _Search(mesh, body, placing, units)
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
-    turns = _turns(placing.up, mesh, is_placed=placing.is_placed)
-    found = [
-        one
-        for here, turn, unit in itertools.product(bodies, turns, units)
-        for kind, shift in _shifts(here, is_placed=placing.is_placed)
-        if not search.too_high(one := _at(search.samples, unit, turn, shift, here, kind), here)
-    ]
+    turns = turns_of(placing.up, mesh, is_placed=placing.is_placed)
+    found = search.by_convention(bodies, turns)
+    if placing.is_whole and found and found[0].fit.is_near:
+        yield _told(found[0])
+        return
+    if placing.pose is None and not any(one.fit.is_plain for one in found):
+        found += search.by_convention([PosedBody(body, standing_pose(*angles)) for angles in _RARER], turns)
+        near = sorted((one for one in found if one.fit.is_near), key=lambda one: one.cost(extent))
+        likely = [search.refined(one, moves=False, scales=False, bends=True) for one in near[:_N_REFINED]]
+        found += [one for one in likely if one.fit.is_good]
     good = [one for one in found if one.fit.is_plain]
     if good:
         least = min(one.cost(extent) for one in good)
@@ -161,6 +176,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         if placing.pose is None:
             likes = sorted((one for one in found if one.is_like(chosen)), key=lambda one: one.cost(extent))
             refined = [search.refined(one, moves=False, scales=False) for one in likes[:2]]
+            if min(one.fit.depth for one in refined) > _TOUCHES:
+                best = min(refined, key=lambda one: one.cost(extent))
+                refined.append(search.refined(best, moves=False, scales=False, bends=True))
             other = min(refined, key=lambda one: one.cost(extent))
             if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.pose.any():
                 yield _told(other)  # and if a limb goes through it there:
@@ -196,7 +214,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         order = [*first, best, *(one for one in order if one not in first)]
     for one in order:
         yield _told(one)
-    lying = [] if placing.up or placing.is_placed else search.along(bodies, _LYING, units, scales=False)
+    lying = [] if placing.up or placing.is_placed else search.along(bodies, LYING, units, scales=False)
     least = min((one.cost(extent) for one in (*good, *order)), default=math.inf)
     # Nobody wears a garment on a hand, or upside down, that can be worn upright.
     lying = [one for one in lying if one.fit.is_plain and _MISFIT * one.cost(extent) < least]
@@ -213,7 +231,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         f"{1e3 * fit.distance:.0f} mm off, and {100 * fit.facing:.0f} % faces outward; say its --unit, --up or --pose, "
         "or place it on the body first"
     )
-    if not len(rim_vertices(mesh.faces)):
+    if is_ball(mesh.faces):
         msg += NO_OPENING
     raise GarmentError(msg)
 
@@ -236,12 +254,21 @@ class _Search:
         """Whether its unit is one that the mesh may be in."""
         return bool(np.isclose(place.unit, self._units).any())
 
+    def by_convention(self, bodies: list[PosedBody], turns: list[F64]) -> list[Place]:
+        """The mesh where it may stand by convention, in each pose, turn and unit."""
+        return [
+            one
+            for here, turn, unit in itertools.product(bodies, turns, self._units)
+            for kind, shift in _shifts(here, is_placed=self._placing.is_placed)
+            if not self.too_high(one := _at(self.samples, unit, turn, shift, here, kind), here)
+        ]
+
     def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
         """The best place at any height along the body, refined from there; none if there are no heights."""
         few = Samples(*(array[::4] for array in self.samples))  # type: ignore[arg-type]
         few = few._replace(area=4 * few.area)
         if scales:  # there is much to try, so what nobody does is left out
-            bodies, turns = bodies[:3], [turn for turn in turns if not _is_sideways(turn)]
+            bodies, turns = bodies[:3], [turn for turn in turns if not is_sideways_turn(turn)]
         found = [
             one
             for here, turn, unit in itertools.product(bodies[::2], turns, units)
@@ -252,93 +279,60 @@ class _Search:
         refined = [self.refined(one, moves=True, scales=scales) for one in found[:_N_REFINED]]
         return sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
 
-    def refined(self, start: Place, *, moves: bool, scales: bool) -> Place:
-        """The best place near `start`, by a simplex search over the pose, and over place and size if wanted."""
+    def refined(self, start: Place, *, moves: bool, scales: bool, bends: bool = False) -> Place:
+        """The best place near `start`, by a simplex search over the pose, and over place and size if wanted.
+
+        Arms come forward, and elbows bend, only if wanted: it takes twice as long.
+        """
         body, samples, turn = PosedBody(self._body, start.pose), self.samples, start.turn
         is_posed = self._placing.pose is not None
         has_legs = parts_legs(start(self._mesh.vertices), self._mesh.faces, self._body)
-        x0 = np.array([0.0, 0.0, 0.0, 0.0, float(start.pose[RIGHT_SHOULDER, 2]), 0.02 * has_legs])
-        steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, *((0, 0) if is_posed else (0.1, 0.06 * has_legs))])
+        arms, elbows = start.pose[RIGHT_SHOULDER], start.pose[RIGHT_ELBOW, 1]
+        angles = np.array([arms[2], max(0.02 * has_legs, start.pose[LEFT_HIP, 2]), elbows, arms[1]])
+        x0 = np.concatenate((np.zeros(4), angles))
+        turning = np.array([0.1, 0.06 * has_legs, 0.15 * bends, 0.1 * bends]) * (not is_posed)
+        steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, *turning])
         free = np.flatnonzero(steps)
         middle = samples.points.mean(0) @ turn.T
         floor = float(body.vertices[:, 1].min())
         extent = float(np.ptp(samples.points, axis=0).max())
 
-        def at(values: F64) -> Place:
-            full = x0.copy()
-            full[free] += values * steps[free]
-            size, *shift, lowered, spread = full
+        def at(full: F64) -> Place:
+            size, shift, angles = full[0], full[1:4], full[4:]
             if not is_posed:
-                body.move(standing_pose(float(np.clip(lowered, -0.2, 1.3)), float(np.clip(spread, 0.0, 0.35))))
+                body.move(standing_pose(*np.clip(angles, *_REACH)))
             unit = min(start.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
-            moved = start.shift + np.array(shift) + (start.unit - unit) * middle  # the middle stays as the size changes
+            moved = start.shift + shift + (start.unit - unit) * middle  # the middle stays as the size changes
             if start.kind == "floor":  # the floor is where the feet of this pose are
                 moved[1] += float(body.vertices[:, 1].min()) - floor
             return _at(samples, unit, turn, moved, body, start.kind)
 
-        def cost(values: F64) -> float:
-            place = at(values)
+        def cost(full: F64) -> float:
+            place = at(full)
             return place.cost(extent) + self.too_high(place, body)
+
+        def there(values: NDArray[Any]) -> F64:
+            full: F64 = x0.copy()
+            full[free] += values * steps[free]
+            return full
+
+        def cost_there(values: NDArray[Any]) -> float:
+            return cost(there(values))
 
         if not len(free):
             return start
+        if bends and not is_posed:
+            x0 = min((np.array([*x0[:6], *bend]) for bend in _BENDS), key=cost)
         simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
         options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
-        found = minimize(cost, np.zeros(len(free)), method="Nelder-Mead", options=options)
-        return at(found.x)
+        found = minimize(cost_there, np.zeros(len(free)), method="Nelder-Mead", options=options)
+        return at(there(found.x))
 
 
 def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody, kind: str) -> Place:
     turned = samples._replace(normals=samples.normals @ turn.T, area=unit**2 * samples.area)
     points = unit * samples.points @ turn.T + shift
     return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()), kind)
-
-
-def _turns(up: str | None, mesh: SurfaceMesh, *, is_placed: bool) -> list[F64]:
-    """Rotations that may bring a mesh upright and to face z; the likeliest first. A placed mesh faces z."""
-    z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
-    if is_placed:
-        return bases
-    found = [_about_y(quarters * np.pi / 2) @ base for quarters in (0, 2, 1, -1) for base in bases]
-    askew = [(_skew(mesh, base), base) for base in bases]
-    return found + [_about_y(half - angle) @ base for half in (0, np.pi) for angle, base in askew if angle]
-
-
-def _about_y(angle: float) -> F64:
-    cos, sin = np.cos(angle).round(12), np.sin(angle).round(12)
-    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-
-
-_LYING = [
-    _about_y(quarters * np.pi / 2) @ np.array(base, np.float64)
-    for quarters in (0, 2, 1, -1)
-    for base in (
-        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-        [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
-        [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
-        [[-1, 0, 0], [0, 0, -1], [0, -1, 0]],
-    )
-]
-"""Rotations that may set upright a mesh that lies on its side, x up or down, or stands on its head."""
-
-
-def _skew(mesh: SurfaceMesh, base: F64) -> float:
-    """By how much a mesh that is turned upright by `base` is askew [rad]: people are broader than deep.
-
-    Zero where it isn't, or where its breadth doesn't show.
-    """
-    area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1)
-    flat = (mesh.vertices[mesh.faces].mean(1) @ base.T)[:, ::2]
-    flat = flat - np.average(flat, axis=0, weights=area)
-    (depth, breadth), axes = np.linalg.eigh((flat.T * area) @ flat)
-    angle = float(np.arctan2(-axes[1, 1], axes[0, 1]))
-    off_axis = abs(angle - np.pi / 2 * round(angle / (np.pi / 2)))
-    return angle if breadth > _BROADER * depth and off_axis > _ASKEW else 0.0
-
-
-def _is_sideways(turn: F64) -> bool:
-    return abs(float(turn[0, 0])) < 0.5
 
 
 def _shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:
@@ -380,7 +374,10 @@ def _told(place: Place) -> Place:
         notes.append("it stood with the floor at 0 and was moved to the body's feet")
     elif np.abs(place.shift).max() > 1e-3:
         notes.append("moved by ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * place.shift)))
-    arms, legs = np.degrees(place.pose[RIGHT_SHOULDER, 2]), np.degrees(place.pose[LEFT_HIP, 2])
-    if abs(arms) > 3 or legs > 3:
-        notes.append(f"modelled with arms {arms:.0f}° down and legs {legs:.0f}° apart; brought into the T-pose")
+    forward, arms, elbows, legs = np.degrees(
+        [*place.pose[RIGHT_SHOULDER, 1:], place.pose[RIGHT_ELBOW, 1], place.pose[LEFT_HIP, 2]]
+    )
+    if max(abs(arms), abs(forward), elbows, legs) > 3:
+        bent = f", {forward:.0f}° forward and bent by {elbows:.0f}°" if max(abs(forward), elbows) > 3 else ""
+        notes.append(f"modelled with arms {arms:.0f}° down{bent} and legs {legs:.0f}° apart; brought into the T-pose")
     return replace(place, notes=notes)

@@ -14,6 +14,7 @@ from refu_core.sdf import ExactSdf
 F64 = NDArray[np.float64]
 
 LEFT_SHOULDER, RIGHT_SHOULDER = (JOINT_NAMES.index(f"{side}_shoulder") for side in ("left", "right"))
+LEFT_ELBOW, RIGHT_ELBOW = (JOINT_NAMES.index(f"{side}_elbow") for side in ("left", "right"))
 LEFT_HIP, RIGHT_HIP = (JOINT_NAMES.index(f"{side}_hip") for side in ("left", "right"))
 
 
@@ -45,9 +46,10 @@ class PosedBody:
         return found.face.long().numpy(), found.barycentrics.double().numpy()
 
 
-def standing_pose(arms: float, legs: float = 0.0) -> F64:
-    """The T-pose with arms lowered and legs spread by some angles [rad], shape (24, 3)."""
+def standing_pose(arms: float, legs: float = 0.0, elbows: float = 0.0, forward: float = 0.0) -> F64:
+    """The T-pose with arms lowered, legs spread, elbows bent and arms brought forward by some angles [rad], (24, 3)."""
     pose = np.zeros((N_JOINTS, 3))
-    pose[LEFT_SHOULDER, 2], pose[RIGHT_SHOULDER, 2] = -arms, arms
+    pose[LEFT_SHOULDER, 1:], pose[RIGHT_SHOULDER, 1:] = (-forward, -arms), (forward, arms)
+    pose[LEFT_ELBOW, 1], pose[RIGHT_ELBOW, 1] = -elbows, elbows
     pose[LEFT_HIP, 2], pose[RIGHT_HIP, 2] = legs, -legs
     return pose

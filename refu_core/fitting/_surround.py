@@ -65,6 +65,11 @@ class Fit(NamedTuple):
         return self.inside < 0.05 and is_on
 
     @property
+    def is_near(self) -> bool:
+        """Whether it has some of the body in it, or lies near it, and doesn't stand beside it."""
+        return self.around > 0 or self.distance < 2 * NEAR
+
+    @property
     def is_ring(self) -> bool:
         """Whether it is around the body and clear of it, however little of the skin it encloses: a belt, a hoop."""
         return self.inside == 0 and self.facing > _RING_FACES and self.distance < 2 * NEAR

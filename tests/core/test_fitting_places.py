@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 from numpy.typing import NDArray
-from outside_meshes import Wanted, cloth
+from outside_meshes import Wanted, button, cloth, together
 from scipy.spatial.transform import Rotation
 
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.fitting import Placing, SurfaceMesh, _fit, fit_garment, standing_pose
+from refu_core.fitting._clean import is_ball
+from refu_core.fitting._pieces import without_floor
 from refu_core.fitting._place import Place, find_places
 from refu_core.fitting._surround import parts_legs
 
@@ -138,3 +141,78 @@ def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
     mesh = cone((0.42, 0.85), (0.085, 1.43))
     made = fit_garment(mesh, load_body("neutral"), name="loose", placing=placing, longest_edge=0.1)
     assert any("bringing it into the T-pose stretched" in text for text in made.warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "angles"),
+    [
+        ("longsleeve-male", (0.7, 0.0, 0.18)),
+        ("longsleeve-male", (0.8, 0.0, 0.8, 0.25)),
+        ("trousers-female", (0.0, 0.1)),
+        ("trousers-female", (0.6, 0.44)),
+    ],
+)
+def test_bent_elbows_and_spread_legs_are_found(name: str, angles: tuple[float, ...]) -> None:
+    """Sleeves round bent elbows were worn on straight ones, and trousers of spread legs were scaled, or refused."""
+    garment = load_garment(name)
+    body, pose = load_body(garment.body), standing_pose(*angles)
+    transforms = body(torch.as_tensor(pose, dtype=torch.float32)[None]).transforms
+    posed = apply_transforms(garment.v_template[None], blend_transforms(garment.weights, transforms))[0]
+    place = next(find_places(SurfaceMesh(posed.double().numpy(), garment.faces.numpy()), body, Placing()))
+    assert place.unit == 1
+    joints = [17, 19] if "sleeve" in name else [1]
+    np.testing.assert_allclose(place.pose[joints], pose[joints], atol=0.09)
+
+
+def test_what_is_said_is_not_overruled() -> None:
+    """A tube of which a third faces the other way was refused, although all was said."""
+    body, mesh = load_body("neutral"), cone((0.3, -0.6), (0.3, -0.1))
+    kept = np.arange(len(mesh.faces)) % 3 > 0
+    flipped = np.where(kept[:, None], mesh.faces, mesh.faces[:, ::-1])
+    soup = SurfaceMesh(mesh.vertices[flipped].reshape(-1, 3), np.arange(flipped.size).reshape(-1, 3))
+    said = Placing(1.0, "y", standing_pose(0.0), is_placed=True)
+    place = next(find_places(soup, body, said))
+    assert not place.fit.is_good
+    beside = SurfaceMesh(soup.vertices + np.array([1.5, 0, 0]), soup.faces)
+    with pytest.raises(GarmentError, match="doesn't surround the body"):
+        next(find_places(beside, body, said))
+
+
+def test_only_a_ball_has_no_opening() -> None:
+    ball, ring = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.torus(1.0, 0.3)
+    assert is_ball(np.asarray(ball.faces, dtype=np.int64))
+    assert not is_ball(np.asarray(ball.faces[1:], dtype=np.int64))
+    assert not is_ball(np.asarray(ring.faces, dtype=np.int64))
+
+
+@pytest.mark.parametrize("taller", [1.0, 1.04])
+def test_a_taller_wearer_s_clothes_are_as_large_as_they_were_for_him(taller: float) -> None:
+    """In centimetres, with eyes: with him, they were made larger than the body, until his skin was outside of it."""
+    shirt, body = load_garment("tshirt-male"), load_body("male")
+    skin = body.v_template.double().numpy()
+    front = float(skin[skin[:, 1] > skin[:, 1].max() - 0.2, 2].max())
+    eyes = [np.array([side * 0.032, skin[:, 1].max() - 0.11, front - 0.02]) for side in (-1, 1)]
+    v, f = together(
+        [
+            (shirt.v_template.double().numpy(), shirt.faces.numpy()),
+            (skin, body.faces.long().numpy()),
+            *(button(at, 0.012) for at in eyes),
+        ]
+    )
+    mesh = SurfaceMesh(100 * taller * (v - [0, skin[:, 1].min(), 0]), f)
+    made = fit_garment(mesh, body, name="shirt", longest_edge=0.1)
+    assert made.template.n_vertices == shirt.n_vertices
+    assert "2 small pieces nearer to it than to its clothes, as eyes are, were left out, too" in made.notes
+    assert ("lengths are cm" in made.notes) == (taller == 1)
+    assert float((made.template.v_template - shirt.v_template).norm(dim=1).mean()) < 0.01
+
+
+def test_a_floor_is_left_out() -> None:
+    v, f = cloth(Wanted(low=0.66, sleeve=0.6, step=0.028))
+    slab = trimesh.creation.box((4, 0.02, 4))
+    parts = [(v, f), (np.asarray(slab.vertices), np.asarray(slab.faces, dtype=np.int64))]
+    kept, notes = without_floor(SurfaceMesh(*together(parts)))
+    assert len(kept.faces) == len(f)
+    assert notes == ["a flat piece, wider than all the rest, was taken for a floor and left out"]
+    for part in (parts[:1], [(v, f), button(np.array([0, 1.2, 0.15]))]):
+        assert without_floor(SurfaceMesh(*together(part)))[1] == []
