@@ -39,8 +39,8 @@ class Aside:
     at most, so it is a dent.
 
     Each middle that is inside asks for the least turn that brings it to the surface, and deep ones count most. So arms
-    move continuously, and where no middle is inside, nothing moves. The exception is an arm that is half-way through the
-    trunk or a thigh: there the nearest way out changes sides, and the arm leaps.
+    move continuously, and where no middle is inside, nothing moves. The exception is an arm that is half-way through
+    the trunk or a thigh: there the nearest way out changes sides, and the arm leaps.
     """
 
     def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:
