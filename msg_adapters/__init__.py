@@ -32,6 +32,7 @@ from msg_adapters.errors import MotionFileError as MotionFileError
 from msg_adapters.errors import TransformError as TransformError
 from msg_adapters.inputs import INPUT_TYPES as INPUT_TYPES
 from msg_adapters.inputs import KEYPOINT_TYPES as KEYPOINT_TYPES
+from msg_adapters.inputs import SMPL_TOPIC as SMPL_TOPIC
 from msg_adapters.inputs import Decoder as Decoder
 from msg_adapters.inputs import Encoder as Encoder
 from msg_adapters.inputs import decoder_for as decoder_for

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from refu_core import GarmentPipeline, SmplBody, SmplFrame
     from refu_core.body import BodyFit
 
-INPUT_TOPIC = "/smpl_params"
+INPUT_TOPIC = f"/{adapters.SMPL_TOPIC}"
 _SHOWN = 8
 PLACED_BY_TF = "the person stays at the origin of {}: tf says where that is, and tf isn't read from a bag"
 

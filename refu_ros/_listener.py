@@ -120,7 +120,7 @@ class Listener:
             self._follow_humans()
         else:
             for person in self._settings.persons:
-                self._listen(person, f"{person}/smpl_params" if person else "smpl_params")
+                self._listen(person, f"{person}/{adapters.SMPL_TOPIC}" if person else adapters.SMPL_TOPIC)
         if topic := self._settings.camera_info:
             self._hear("/camera", adapters.CAMERA_INFO, topic, self._on_camera, ros_qos(INPUT_QOS))
 

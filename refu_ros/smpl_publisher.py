@@ -14,7 +14,7 @@ import numpy as np
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import INPUT_TYPES, WORLD_FRAME, Encoder, encoder_for, load_motion
+from msg_adapters import INPUT_TYPES, SMPL_TOPIC, WORLD_FRAME, Encoder, encoder_for, load_motion
 from refu_core import FrameError, SmplFrame
 from refu_core.options import check, fixed
 from refu_core.recordings import Axes
@@ -23,8 +23,6 @@ from refu_ros._interfaces import interface
 from refu_ros._parameters import declare, listing
 from refu_ros._program import hear, run, spin
 from refu_ros._settings import AXES, require_persons
-
-TOPIC = "smpl_params"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +72,7 @@ class SmplPublisher(GuardedNode):
         self._outputs = [
             self.create_publisher(
                 interface(message_type),
-                f"{name}/{TOPIC}" if name else TOPIC,
+                f"{name}/{SMPL_TOPIC}" if name else SMPL_TOPIC,
                 QoSProfile(depth=1),
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )

@@ -10,10 +10,8 @@ from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.bags._reader import BagReader
 from msg_adapters.cdr import split_stamp
 from msg_adapters.errors import BagError, DecodeError, EncodeError
-from msg_adapters.inputs import INPUT_TYPES, KEYPOINT_TYPES, Decoder, decoder_for
+from msg_adapters.inputs import INPUT_TYPES, KEYPOINT_TYPES, SMPL_TOPIC, Decoder, decoder_for
 from refu_core.frames import SmplFrame
-
-_USUAL_NAME = "smpl_params"
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,7 @@ def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Se
         return chosen
     found = [topic for topic in topics if topic.message_type in kinds and topic.message_count]
     # A robot's own joint states have an input type too: before giving up, prefer the name the node listens to.
-    usual = [topic for topic in found if topic.name.rsplit("/", maxsplit=1)[-1] == _USUAL_NAME]
+    usual = [topic for topic in found if topic.name.rsplit("/", maxsplit=1)[-1] == SMPL_TOPIC]
     if len(found) == 1 or len(usual) == 1:
         return (usual or found)[0]
     if found:

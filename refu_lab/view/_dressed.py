@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 _AWAY_S = 0.25
 """A person whose nearest frame is farther off in time isn't shown [s]."""
-_USUAL = "smpl_params"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +160,7 @@ class DressedFilm:
         topics = _topics_of_people(path) if options.topic is None and options.input_type is None else []
         found = {name: self._frames(options)} if len(topics) < 2 else {}
         for topic in topics if len(topics) > 1 else ():
-            person = topic.strip("/").removesuffix(_USUAL).rstrip("/") or "person"
+            person = topic.strip("/").removesuffix(adapters.SMPL_TOPIC).rstrip("/") or "person"
             found[f"{name}/{person}" if name else person] = self._frames(replace(options, topic=topic))
         start = min(frames[0].stamp_ns for frames in found.values())  # each file begins at zero
         tracks = []
@@ -203,7 +202,7 @@ def _topics_of_people(path: Path) -> list[str]:
             for topic in reader.topics
             if topic.message_type in adapters.INPUT_TYPES.values()
             and topic.message_count
-            and topic.name.rsplit("/", maxsplit=1)[-1] == _USUAL
+            and topic.name.rsplit("/", maxsplit=1)[-1] == adapters.SMPL_TOPIC
         ]
 
 
