@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from refu_core.backbones import Skinned
 from refu_core.body import Surface
-from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT
+from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT, OwnSide
 from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
 from refu_core.modes import DEFAULT_MARGIN
@@ -100,7 +101,7 @@ def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     for name, pipeline in subject.one_by_one.items():
         (out,) = pipeline(trial.frames)
         mesh = out[name]
-        _, lack = _closest_skin(subject, out, mesh)
+        _, lack = _closest_skin(subject, out, torch.tensor(mesh.raw))
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
         near = _largest_near(lack, pipeline.garments[name].edges.numpy())
         limit = (
@@ -116,9 +117,7 @@ def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
         (out,) = pipeline(trial.frames)
         moved = np.linalg.norm(out[name].local - out[name].raw, axis=1)
         yield _finite(out)
-        yield _farthest(
-            moved, _pressed(subject, trial.frames[0], together=True)[name] + MAX_DISPLACEMENT + _BOUND_SLACK
-        )
+        yield _farthest(moved, _pressed(subject, trial.frames[0])[name] + MAX_DISPLACEMENT + _BOUND_SLACK)
 
 
 def no_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
@@ -164,7 +163,7 @@ def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 
 def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> dict[str, NDArray[np.floating]]:
-    """How far vertices of each garment go towards the skin that they lie on, pressed by limbs or deep inside [m], (N,).
+    """How far vertices of each garment go to the skin that they lie on, pressed by limbs or deep in the body [m], (N,).
 
     For garments worn `together`, this includes how far they are unfolded beforehand.
     """
@@ -208,19 +207,20 @@ class _Aims:
     """Where collision handling takes the N vertices of a garment: to the skin, and to the garments worn below."""
 
     places: list[NDArray[np.floating]]
-    """The closest point of each surface to each vertex before collision handling [m], (N, 3)."""
+    """The closest point of each surface to each vertex before collision handling [m], (N, 3); of the body, once cloth
+    is on its own side (`OwnSide`)."""
     is_pushed: list[NDArray[np.bool_]]
     """Whether each vertex is nearer to that surface than allowed, (N,)."""
 
 
 def _closest_skin(
-    subject: Subject, out: PipelineOutput, mesh: GarmentMesh
+    subject: Subject, out: PipelineOutput, raw: Tensor
 ) -> tuple[NDArray[np.float32], NDArray[np.floating]]:
-    """The skin closest to each vertex before collision handling, (N, 3), and its shortfall from the margin, (N,) [m].
+    """The skin closest to each of the vertices `raw`, (N, 3), and its shortfall from the margin, (N,) [m].
 
     Where limbs overlap, the closest skin may be inside the body; then the closest skin outside is taken.
     """
-    raw, body = torch.tensor(mesh.raw), torch.tensor(out.body)
+    body = torch.tensor(out.body)
     sdf, stage = subject.distances["exact"], subject.contact_stage
     sdf.update(body)
     stage.update(body)
@@ -237,7 +237,11 @@ def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> d
     worn: list[GarmentMesh] = []
     for name in inner_first(pipeline.garments):
         mesh = out[name]
-        place, lack = _closest_skin(subject, out, mesh)
+        raw, skin = torch.tensor(mesh.raw), pipeline.outfit.below[name](torch.tensor(out.body)[None])[0]
+        _, lack = _closest_skin(subject, out, raw)
+        own_side = OwnSide(pipeline.garments[name].mesh, raw.device)
+        moved = own_side(raw, own_side.share(subject.distances["exact"].query(raw).distance), skin)
+        place, _ = _closest_skin(subject, out, moved)
         places: list[NDArray[np.floating]] = [place]
         is_pushed = [lack > 0]
         for below in worn:
