@@ -130,7 +130,3 @@ def _failed(reason: str, code: int) -> int:
         traceback.print_exc()
     print(f"refu: {printable(reason)}", file=sys.stderr)
     return code
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -237,11 +237,13 @@ def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> d
     worn: list[GarmentMesh] = []
     for name in inner_first(pipeline.garments):
         mesh = out[name]
-        raw, skin = torch.tensor(mesh.raw), pipeline.outfit.below[name](torch.tensor(out.body)[None])[0]
-        _, lack = _closest_skin(subject, out, raw)
+        raw = torch.tensor(mesh.raw)
+        place, lack = _closest_skin(subject, out, raw)
         own_side = OwnSide(pipeline.garments[name].mesh, raw.device)
-        moved = own_side(raw, own_side.share(subject.distances["exact"].query(raw).distance), skin)
-        place, _ = _closest_skin(subject, out, moved)
+        share = own_side.share(subject.distances["exact"].query(raw).distance)
+        if bool(share.any()):
+            skin = pipeline.outfit.below[name](torch.tensor(out.body)[None])[0]
+            place, _ = _closest_skin(subject, out, own_side(raw, share, skin))
         places: list[NDArray[np.floating]] = [place]
         is_pushed = [lack > 0]
         for below in worn:

@@ -490,7 +490,7 @@ def assert_closed(bag: Path, most: int) -> None:
 
 def test_a_replay_that_is_terminated_leaves_a_readable_bag(tmp_path: Path) -> None:
     bag, out = write_bag(tmp_path / "long.mcap", motion(3000)), tmp_path / "out.mcap"  # a minute and a half
-    command = [sys.executable, "-m", "refu_lab.cli", "replay", bag, "--output", out, "--speed", "real", "--quiet"]
+    command = [sys.executable, "-m", "refu_lab", "replay", bag, "--output", out, "--speed", "real", "--quiet"]
     options = ["--garments", "short-pant-male", "--sdf", "none"]
     process = subprocess.Popen([*map(str, command), *options], stdout=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 300
