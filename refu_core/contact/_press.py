@@ -66,6 +66,9 @@ class Press:
     Where another limb comes between a vertex and its skin, the vertex is drawn back to the skin's side of it, and its
     neighbours with it. All of this is continuous: the nearer a limb is to the line from skin to vertex, the farther
     back the vertex goes.
+
+    It is called twice: for cloth as predicted, and for cloth that was pushed off the body. A limb may push a vertex to
+    its far side, and the skin may push it into a limb.
     """
 
     def __init__(
@@ -106,13 +109,19 @@ class Press:
         } | dict.fromkeys(("boxed", "near", "in_front", "rows"), np.zeros(n))
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
+        self._meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
+        close = self._launches(fabric, garment.edge_length)
+        wide = close if knows_arms else self._launches(fabric, settings.limb_reach)
+        self._commands = {True: close, False: wide}
+
+    def _launches(self, fabric: Any, beside: float) -> dict[str, Any]:
+        """The recorded steps, by name, for cloth that feels limbs up to `beside` [m] to its side."""
+        settings, meshes, n = self._settings, self._meshes, len(self._points)
         feel = kernels.Feel()
-        feel.room, feel.lies = settings.gap, settings.limb_reach
-        feel.beside = garment.edge_length if knows_arms else settings.limb_reach
-        meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
+        feel.room, feel.lies, feel.beside = settings.gap, settings.limb_reach, beside
         sweeps, near = settings.around, settings.near
         launches: dict[str, tuple[Any, int, list[Any]]] = {
-            "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, limbs.bundles, feel]),
+            "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, feel]),
             "press all": (kernels.press_all_kernel, 1, [fabric, meshes, feel, sweeps, near]),
             "press": (kernels.press_kernel, n, [fabric, meshes, feel]),
             "lower": (kernels.lower_kernel, n, [fabric, feel]),
@@ -120,30 +129,35 @@ class Press:
         for sweep in range(sweeps):
             fields = [fabric.cut, fabric.spread] if sweep % 2 == 0 else [fabric.spread, fabric.cut]
             launches[f"spread {sweep}"] = kernels.spread_kernel, n, [fabric, 0.0 if sweep < near else 1.0, *fields]
-        self._commands = {name: recorded(*launch, self.device) for name, launch in launches.items()}
+        return {name: recorded(*launch, self.device) for name, launch in launches.items()}
 
     @torch.no_grad()
-    def __call__(self, points: Tensor, skin: Tensor) -> Tensor:
-        """The garment (N, 3) [m], pressed by the limbs to the `skin` (N, 3) [m] that it lies on."""
+    def __call__(self, points: Tensor, skin: Tensor, *, was_pushed: bool = False) -> Tensor:
+        """The garment (N, 3) [m], pressed by the limbs to the `skin` (N, 3) [m] that it lies on.
+
+        Once it `was_pushed` off the body, only limbs within an edge length to its side count. Where no limb comes
+        between, a CPU returns the very same points.
+        """
+        commands = self._commands[was_pushed]
         self._points.copy_(points)
         self._skin.copy_(skin)
         self._counts.zero_()
         with torch_stream(self.device):
-            self._commands["look"].launch()
+            commands["look"].launch()
             wanted = int(self._counts[kernels.WANTED]) if self._is_serial else -1
             if not wanted:
                 return points
             self._limbs.pose(wanted)
             if self._is_serial:
-                self._commands["press all"].launch()
+                commands["press all"].launch()
                 if not self._counts[kernels.PRESSED]:
                     return points
             else:
                 self._cut.zero_()
-                self._commands["press"].launch()
+                commands["press"].launch()
                 for sweep in range(self._settings.around):
-                    self._commands[f"spread {sweep}"].launch()
-                self._commands["lower"].launch()
+                    commands[f"spread {sweep}"].launch()
+                commands["lower"].launch()
         pressed: Tensor = self._points.clone()
         return pressed
 

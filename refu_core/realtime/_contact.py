@@ -84,6 +84,7 @@ class ContactStage:
             self._off_skin = {
                 name: Parting(one.mesh, one.v_template, self._skin, settings=settings) for name, one in garments.items()
             }
+        self._skin_of: dict[str, Tensor] = {}
         self._asked = {name: self.sdf.of_garment(one) for name, one in garments.items()}
         self.resolvers = {n: Resolver(one.faces, one.n_vertices, settings=settings) for n, one in garments.items()}
         self._strain = {name: StrainLimit(one.mesh, body.device, settings=settings) for name, one in garments.items()}
@@ -92,7 +93,7 @@ class ContactStage:
             for name, one in garments.items()
             if len(garments) > 1
         }
-        self._below = {
+        self._layers = {
             name: {inner: _layer(garments[name], garments[inner], settings) for inner in self.order[:i]}
             for i, name in enumerate(self.order)
         }
@@ -102,7 +103,7 @@ class ContactStage:
 
         Raises `MeshError` for a body that isn't finite.
         """
-        self._body = body
+        self._body, self._skin_of = body, {}
         # Where skin has given way as far as it may, cloth may lack room. A GPU isn't asked: there it is assumed.
         self._is_tight = self._has_room and (not self._is_serial or bool(n_held > 0))
         if self._is_tight:
@@ -117,14 +118,17 @@ class ContactStage:
         """Vertices (V, 3) [m], levelled where folded over beside another garment, for joint rotations (24, 3, 3)."""
         return self._unfold[name](vertices, rotation) if name in self._unfold else vertices
 
-    def press(self, name: str, vertices: Tensor) -> Tensor:
-        """Vertices (V, 3) [m], drawn back to their skin where a limb comes between."""
-        return self._press[name](vertices, self._skin_below(name)) if self._has_room else vertices
+    def press(self, name: str, vertices: Tensor, *, was_pushed: bool = False) -> Tensor:
+        """Vertices (V, 3) [m], drawn back to their skin where a limb comes between (`Press`)."""
+        if not self._has_room:
+            return vertices
+        return self._press[name](vertices, self._skin_below(name), was_pushed=was_pushed)
 
     def _skin_below(self, name: str) -> Tensor:
         """The skin that each vertex of a garment lies on [m], shape (V, 3)."""
-        skin: Tensor = self._outfit.below[name](self._body[None])[0]
-        return skin
+        if name not in self._skin_of:
+            self._skin_of[name] = self._outfit.below[name](self._body[None])[0]
+        return self._skin_of[name]
 
     def own_side(self, name: str, vertices: Tensor, on_mean: Tensor, reach: float) -> tuple[Tensor, SdfSample]:
         """Vertices (V, 3) [m], on their own side of the body where they were deep in it, and their distances.
@@ -149,7 +153,7 @@ class ContactStage:
         """
         n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
         for inner, garment in worn.items():
-            vertices, n_low = self._below[name][inner](vertices, garment.vertices, goes_on=goes_on)
+            vertices, n_low = self._layers[name][inner](vertices, garment.vertices, goes_on=goes_on)
             n_layered = n_layered + n_low
         return vertices, n_layered
 
@@ -180,6 +184,10 @@ class ContactStage:
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         numbers, kept = done.numbers, margin
+        drawn = self.press(name, done.vertices, was_pushed=True)
+        if drawn is not done.vertices:
+            pressed = pressed + (drawn - done.vertices)
+            done = resolver(drawn, self.sdf, None, margin=margin)
         if worn:
             vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
             kept = self._settings.layer_margin * margin
@@ -204,7 +212,7 @@ class ContactStage:
 
         Repeats as long as fewer cuts are left: in a crease without room the way out of one fold leads into the next.
         """
-        partings = [layer.parting for layer in self._below[name].values()]
+        partings = [layer.parting for layer in self._layers[name].values()]
         resolver, before = self.resolvers[name], done.vertices
         n_cut = torch.stack([parting.find(before) for parting in partings])
         for _ in range(self._settings.max_pushes):

@@ -135,7 +135,7 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
                 one._is_serial = False
         for resolver in contact.resolvers.values():
             resolver._is_serial = False
-        for layers in contact._below.values():
+        for layers in contact._layers.values():
             for layer in layers.values():
                 layer._is_serial = layer.parting._is_serial = False
     return pipeline._steps[0]

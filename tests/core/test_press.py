@@ -68,10 +68,12 @@ def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> ND
     return found
 
 
+@pytest.mark.parametrize("was_pushed", [False, True])
 @pytest.mark.parametrize("knows_arms", [False, True])
-def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
+def test_is_what_a_look_from_the_skin_says(knows_arms: bool, was_pushed: bool) -> None:
     points, skin, body = beside(1.45)
-    pressed = made(body, sweeps=0, knows_arms=knows_arms)(points, skin).double().numpy()
+    press = made(body, sweeps=0, knows_arms=knows_arms)
+    pressed = press(points, skin, was_pushed=was_pushed).double().numpy()
     x, at = points.double().numpy(), skin.double().numpy()
     parts = (joints_of("trunk", "head", "left_thigh"), *ARMS)
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
@@ -79,7 +81,7 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool) -> None:
     to_skin = cKDTree(outfit().body.v_template.numpy()).query(rest)[0]
     is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.limb_reach)
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
-    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.limb_reach
+    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms or was_pushed else how.limb_reach
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
