@@ -19,7 +19,7 @@ from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
 from refu_core.simulation._poses import Clip, clip_pose, random_pose
-from refu_core.simulation._postures import drawn_posture
+from refu_core.simulation._postures import FIRST_POSTURES, POSTURES, drawn_posture
 
 TRAIN, TEST = 0, 1
 MAX_PIVOTS_SHARE = 0.5
@@ -69,6 +69,8 @@ class SamplePlan:
     """Standard deviation of β and γ before they are cut off at ±2."""
     block: int = 12
     """Most slots that are simulated one after the other from one canonical drape."""
+    postures: Sequence[str] = FIRST_POSTURES
+    """Names of the postures that are drawn, each as often."""
 
     def __post_init__(self) -> None:
         """Raises `SimulationError` for values that make no plan; plans are also read from cards."""
@@ -82,6 +84,10 @@ class SamplePlan:
             raise SimulationError(msg)
         if self.count < 1 or self.pivots < 1 or self.poses_per_pair < 1 or self.block < 1:
             msg = f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}"
+            raise SimulationError(msg)
+        is_listed = isinstance(self.postures, (list, tuple)) and len(self.postures) > 0
+        if not is_listed or not all(isinstance(name, str) and name in POSTURES for name in self.postures):
+            msg = f"wanted names of postures, from {', '.join(POSTURES)[:160]}…, got {str(self.postures)[:80]}"
             raise SimulationError(msg)
         of_poses = self.recorded_share, self.posture_share
         if not (0 <= self.test_share < 1 and min(of_poses) >= 0 and sum(of_poses) <= 1 and self.spread > 0):
@@ -151,6 +157,6 @@ class SamplePlan:
         if kind < self.recorded_share and clips:
             return clip_pose(clips, rng)
         if self.recorded_share <= kind < self.recorded_share + self.posture_share:
-            pose, which = drawn_posture(rng)
+            pose, which = drawn_posture(rng, self.postures)
             return pose, -1, which
         return random_pose(rng), -1, -1

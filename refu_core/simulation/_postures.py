@@ -1,8 +1,8 @@
-"""Postures of everyday life that recorded walks lack: limbs on the body, arms overhead, sitting, kneeling, crawling."""
+"""Postures of everyday life that recorded walks lack: limbs on the body, arms overhead, sitting, kneeling, lying."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,10 +85,63 @@ POSTURES: Mapping[str, Angles] = {
         "right_knee": (55, 0, 0),
         **_both(shoulder=(10, -25, -70), elbow=(0, -40, 0)),
     },
+    "cross-legged": _both(shoulder=(14, -30, -72), elbow=(0, -45, 0), hip=(-89, 80, -10), knee=(122, 0, 0)),
+    "straddle": _both(shoulder=(12, -50, -40), elbow=(0, -15, 0), hip=(-78, 22, 40), knee=(8, 0, 0)),
+    "deep lunge": {
+        "left_hip": (-98, 0, 6),
+        "left_knee": (98, 0, 0),
+        "right_hip": (35, 0, -5),
+        "right_knee": (25, 0, 0),
+        **_both(shoulder=(10, -30, -60), elbow=(0, -50, 0)),
+    },
+    "side lunge": {
+        "pelvis": (15, 0, 0),
+        "left_hip": (-55, 15, 42),
+        "left_knee": (92, 0, 0),
+        "right_hip": (-12, 0, -40),
+        **_both(shoulder=(0, -55, -45), elbow=(0, -55, 0)),
+    },
+    "high kick": {
+        **_HANGING,
+        "spine1": (8, 0, 0),
+        "left_hip": (-98, 0, 5),
+        "left_knee": (18, 0, 0),
+        "right_hip": (6, 0, 0),
+    },
+    "side kick": {
+        "pelvis": (0, 0, -20),
+        "left_hip": (-18, 0, 45),
+        "left_knee": (12, 0, 0),
+        "right_hip": (0, 0, 18),
+        **_both(shoulder=(0, -50, -40), elbow=(0, -80, 0)),
+    },
+    "hugging oneself": {
+        "left_collar": (0, -12, 0),
+        "right_collar": (0, 12, 0),
+        "left_shoulder": (28, -78, -38),
+        "left_elbow": (0, -105, 0),
+        "right_shoulder": (14, 80, 28),
+        "right_elbow": (0, 98, 0),
+    },
+    "lying on the back": {"pelvis": (-90, 0, 0), **_both(shoulder=(8, -10, -62), hip=(-8, 0, 8), knee=(12, 0, 0))},
+    "lying on the belly": {
+        "pelvis": (90, 0, 0),
+        "neck": (-25, 0, 0),
+        **_both(shoulder=(-18, 8, 38), elbow=(0, -75, 0), hip=(0, 0, 8)),
+    },
+    "lying on the side": {
+        "pelvis": (0, 0, 90),
+        "left_shoulder": (0, 0, 55),
+        "right_shoulder": (18, 28, 68),
+        "right_elbow": (0, 42, 0),
+        **_both(hip=(-28, 0, 0), knee=(42, 0, 0)),
+    },
 }
 """By name: rotation vectors of joints [degrees], zero for those that aren't named; SMPL's axes, x to the left."""
 SELF_TOUCHING = tuple(POSTURES)[:8]
 """The postures in which the skin intersects itself."""
+FIRST_POSTURES = tuple(POSTURES)[:18]
+"""The postures of plans that don't say which."""
 _SPREAD = 8.0
 """Standard deviation of a drawn posture's joints about the named one, in each coordinate [degrees]."""
 _STIFF = tuple(JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right") for name in ("foot", "wrist", "hand"))
@@ -103,17 +156,16 @@ def posture(name: str) -> NDArray[np.float32]:
     return pose
 
 
-def drawn_posture(rng: np.random.Generator) -> tuple[NDArray[np.float32], int]:
-    """One of `POSTURES`, varied at random, mirrored or not, without heading; and its number.
+def drawn_posture(rng: np.random.Generator, names: Sequence[str]) -> tuple[NDArray[np.float32], int]:
+    """One of the postures `names`, varied at random, mirrored or not, without heading; and its number in `POSTURES`.
 
     Rotation vectors [rad], shape (24, 3).
     """
-    names = tuple(POSTURES)
-    which = int(rng.integers(len(names)))
+    name = names[int(rng.integers(len(names)))]
     noise = np.radians(rng.normal(0.0, _SPREAD, (len(JOINT_NAMES), 3)))
     noise[_STIFF, :] = 0.0
-    named = Rotation.from_rotvec(posture(names[which]).astype(np.float64))
+    named = Rotation.from_rotvec(posture(name).astype(np.float64))
     pose = (Rotation.from_rotvec(noise) * named).as_rotvec().astype(np.float32)
     if rng.random() < 0.5:
         pose = mirrored(pose)
-    return without_heading(pose), which
+    return without_heading(pose), tuple(POSTURES).index(name)

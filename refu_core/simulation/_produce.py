@@ -18,6 +18,7 @@ from refu_core._versions import versions
 from refu_core.errors import SimulationError
 from refu_core.simulation._plan import SamplePlan
 from refu_core.simulation._poses import Clip, as_clips, split_clips
+from refu_core.simulation._postures import POSTURES
 from refu_core.simulation._selection import CAUSES
 from refu_core.simulation._store import QUANTUM, TO_DO, Rows, has_rows, locked, read_card, write_card
 from refu_core.simulation._summary import summarise
@@ -156,6 +157,7 @@ def simulate_dataset(
     test_share: float = 1 / 6,
     recorded_share: float = SamplePlan.recorded_share,
     posture_share: float = SamplePlan.posture_share,
+    postures: Sequence[str] = tuple(POSTURES),
     pivots: int = SamplePlan.pivots,
     settings: SimulationSettings | None = None,
     progress: Callable[[Progress], None] | None = None,
@@ -176,6 +178,7 @@ def simulate_dataset(
         test_share: share of the samples that is kept for the test.
         recorded_share: share of the poses that are frames of the motions.
         posture_share: share of the poses that are varied everyday postures; the others are drawn.
+        postures: which of `POSTURES` these are.
         pivots: style-shape pairs that half of the training samples share.
         settings: settings of simulation and selection.
         progress: called in this process after each slot.
@@ -193,7 +196,14 @@ def simulate_dataset(
     clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(as_clips(motions))
     recorded_share = 0.0 if motions is None else recorded_share
     plan = SamplePlan(
-        garment, count, seed, test_share, pivots, SamplePlan.poses_per_pair, recorded_share, posture_share
+        garment,
+        count,
+        seed,
+        test_share=test_share,
+        pivots=pivots,
+        recorded_share=recorded_share,
+        posture_share=posture_share,
+        postures=postures,
     )
     make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
     produce(make, Path(output), engine=engine, progress=progress)

@@ -513,7 +513,7 @@ def test_recorded_and_drawn_poses_are_mixed(clips: Path) -> None:
 
 
 def test_postures_have_their_share_and_are_held_as_others_would() -> None:
-    plan = SamplePlan(GARMENT, 400, posture_share=0.4)
+    plan = SamplePlan(GARMENT, 400, posture_share=0.4, postures=tuple(POSTURES))
     drawn = [plan.pose(slot, 0, []) for slot in range(400)]
     numbers = np.array([frame for _, _, frame in drawn])
     assert {clip for _, clip, _ in drawn} == {-1}
@@ -534,6 +534,25 @@ def test_a_plan_without_postures_is_as_it_was() -> None:
     old, new = SamplePlan(GARMENT, 30), SamplePlan(GARMENT, 30, posture_share=0.0)
     assert all(np.array_equal(old.pose(slot, 0, [])[0], new.pose(slot, 0, [])[0]) for slot in range(30))
     assert old.pose(3, 0, [])[0][18, 1] == pytest.approx(-0.8027, abs=1e-3)
+
+
+def test_a_plan_draws_the_postures_that_it_names() -> None:
+    named = "straddle", "squat"
+    plan = SamplePlan(GARMENT, 40, recorded_share=0.0, posture_share=1.0, postures=named)
+    numbers = {plan.pose(slot, 0, [])[2] for slot in range(40)}
+    assert numbers == {list(POSTURES).index(name) for name in named}
+
+
+def test_plans_that_name_no_postures_draw_the_first_ones() -> None:
+    """Cards of sets that were made before there were others don't name any."""
+    plan = SamplePlan(GARMENT, 300, recorded_share=0.0, posture_share=1.0)
+    assert {plan.pose(slot, 0, [])[2] for slot in range(300)} == set(range(18))
+
+
+@pytest.mark.parametrize("named", [(), ("headstand",), "squat", ("squat", 3), None])
+def test_postures_that_are_none_are_refused(named: object) -> None:
+    with pytest.raises(SimulationError, match="wanted names of postures"):
+        SamplePlan(GARMENT, 10, postures=named)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("shares", [{"posture_share": -0.1}, {"recorded_share": 0.7, "posture_share": 0.4}])
