@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,6 @@ def _crowd(rng: np.random.Generator) -> Trial:
     return Trial(tuple(_calm(0.6)(rng).frames[0] for _ in range(_FRAMES)))
 
 
-_WITH_DISTANCE = ("accurate", "hybrid", "approx")
 CHECKS: dict[str, Check] = {
     check.name: check
     for check in (
@@ -102,25 +102,22 @@ CHECKS: dict[str, Check] = {
             Check(f"numbers: distance, {name}", _calm(0.5), numbers.distances(place))
             for name, place in numbers.POINTS.items()
         ),
-        Check("guarantees: nothing inside", _any_day, guarantees.nothing_inside, trials=4, sdf_modes=_WITH_DISTANCE),
-        Check(
-            "guarantees: nothing inside, garment buried in the body",
-            _calm_day,
-            guarantees.buried,
-            sdf_modes=_WITH_DISTANCE,
-        ),
+        Check("guarantees: nothing inside", _any_day, guarantees.nothing_inside, trials=4, needs_sdf=True),
+        Check("guarantees: nothing inside, garment buried in the body", _calm_day, guarantees.buried, needs_sdf=True),
         Check(
             "guarantees: nothing inside, promised poses and shapes",
             _promised,
             guarantees.nothing_inside,
-            trials=8,
-            sdf_modes=_WITH_DISTANCE,
+            8,
+            needs_sdf=True,
         ),
         Check("guarantees: whatever is inside is counted", _wide, guarantees.counted, trials=8),
         Check("guarantees: no vertex thrown out", _any_day, guarantees.not_thrown, trials=2),
         Check("guarantees: displacement bounded in any pose", _any_frame, guarantees.bounded, trials=4),
         Check("guarantees: no jumps in smooth motion", _motion, guarantees.no_jumps),
-        Check("guarantees: no jumps in smooth motion, worn together", _motion, guarantees.no_jumps_together),
+        Check(
+            "guarantees: no jumps in smooth motion, worn together", _motion, partial(guarantees.no_jumps, together=True)
+        ),
         Check("guarantees: bounded jumps through self-contact", _folding, guarantees.bounded_jumps),
         Check("invariance: the person turned", _calm(0.6), invariance.turned, trials=2, repeats=1),
         Check("invariance: the person 100 km away", _calm(0.6), invariance.moved, trials=2, repeats=1),

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
-from refu_lab.stress._subject import Subject, distance_to_mesh
+from refu_lab.stress._subject import Subject, distance_to_mesh, predicted
 from refu_lab.stress._trial import Measurement, Trial
 
 ROUNDING = 5e-6
@@ -45,7 +45,7 @@ def collider_against_float64(subject: Subject, trial: Trial) -> Iterator[Measure
 def _compared(subject: Subject, trial: Trial, rounding: float) -> Iterator[Measurement]:
     out = subject.pipeline(trial.frames[0])
     first = [out.body, *(mesh.raw for mesh in out.values())]
-    ours, wanted = subject.in_float32(trial.frames), subject.in_float64(trial.frames)
+    ours, wanted = (predicted(outfit, trial.frames) for outfit in (subject.pipeline.outfit, subject.outfit64))
     turn = 1 + np.array([np.linalg.norm(frame.pose, axis=1).max() for frame in trial.frames]) / np.pi
     deviation = np.zeros(len(trial.frames))
     limit = np.zeros_like(deviation)

@@ -40,17 +40,14 @@ class StressResult:
     """Files of the worst cases."""
 
     @property
-    def _all(self) -> list[Tally | SoakResult]:
-        return [*self.tallies, *self.soaks]
-
-    @property
     def failures(self) -> int:
         """Number of failed trials, and of limits that soaks exceeded."""
-        return sum(row.failures for row in self._all)
+        return sum(one.failures for one in self.tallies) + sum(one.failures for one in self.soaks)
 
     def as_dict(self) -> dict[str, Any]:
         """The results, ready for JSON."""
-        return {"rows": [row.as_dict() for row in self._all], "left_out": self.left_out, "failures": self.failures}
+        rows = [one.as_dict() for one in self.tallies] + [one.as_dict() for one in self.soaks]
+        return {"rows": rows, "left_out": self.left_out, "failures": self.failures}
 
 
 def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
@@ -67,7 +64,9 @@ def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
     has_soak = "soak" in options.parts
     with one_thread():
         subjects = [Subject(one, weights=options.weights, collider=options.collider) for one in wardrobes]
-        pairs = [(check, one) for check in checks for one in subjects if check.holds_for(one.wardrobe)]
+        pairs = [
+            (check, one) for check in checks for one in subjects if not check.needs_sdf or one.wardrobe.sdf != "none"
+        ]
         result.tallies.extend(_run_checks(options, pairs, seconds * (1 - _SOAK_SHARE * has_soak), progress=progress))
         for subject in subjects if has_soak else ():
             share = _SOAK_SHARE if checks else 1.0
@@ -158,49 +157,34 @@ def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = Tr
 
 def stress_table(result: StressResult) -> str:
     """What `refu stress` prints: all rows, the faults, and where the worst cases are."""
-    lines = []
+    lines, rows = list[str](), list[tuple[str, ...]]()
     if result.tallies:
-        rows = []
         for tally in result.tallies:
             worst = tally.worst or Measurement()
             counts = (tally.runs, tally.failures, tally.nan, tally.refused)
             rows.append((tally.case, tally.mode, *map(str, counts), length(worst.deviation), length(worst.limit)))
-        lines += [
-            format_table(("case", "mode", "runs", "failures", "NaN", "refused", "deviation", "limit"), rows),
-            "(deviation and limit are those of the worst trial; a few limits depend on the frame)",
-            "",
-        ]
+        header: tuple[str, ...] = ("case", "mode", "runs", "failures", "NaN", "refused", "deviation", "limit")
+        note = "(deviation and limit are those of the worst trial; a few limits depend on the frame)"
+        lines += [format_table(header, rows), note, ""]
     if result.soaks:
         header = ("soak", "frames", "NaN", "memory MB", "", "p99 ms", "", "wall p99 ms", "machine")
-        soaks = [
-            (
-                soak.mode,
-                f"{soak.frames} by {soak.persons}",
-                str(soak.nan),
-                _first_last("{:.0f}", soak.tenths_mb),
-                f"{100 * soak.growth:+.1f} %",
-                _first_last("{:.1f}", soak.tenths_ms),
-                f"{100 * soak.slowdown:+.1f} %",
-                _first_last("{:.1f}", soak.tenths_wall_ms),
-                f"{100 * soak.machine_slowdown:+.1f} %",
+        rows = []
+        for one in result.soaks:
+            mb, ms, wall = (
+                f"{one.tenths[name][0]:.{digits}f} → {one.tenths[name][-1]:.{digits}f}"
+                for name, digits in (("mb", 0), ("ms", 1), ("wall_ms", 1))
             )
-            for soak in result.soaks
-        ]
-        lines += [
-            format_table(header, soaks),
-            "(first tenth → last tenth; machine: of the processor time of a fixed piece of work)",
-            "",
-        ]
+            more, slower, machine = (f"{100 * one.growth(name):+.1f} %" for name in ("mb", "ms", "yardstick_ms"))
+            frames = f"{one.frames} by {one.persons}"
+            rows.append((one.mode, frames, str(one.nan), mb, more, ms, slower, wall, machine))
+        note = "(first tenth → last tenth; machine: of the processor time of a fixed piece of work)"
+        lines += [format_table(header, rows), note, ""]
     lines += [f"{tally.case} ({tally.mode}): {fault}" for tally in result.tallies for fault in tally.faults]
     lines += [f"left out: {text}" for text in result.left_out]
     if result.files:
         lines.append(f"worst cases: {result.files[0].parent}/*.npz, to be tried again with refu stress --replay FILE")
     lines.append("nothing failed" if not result.failures else f"{result.failures} FAILED")
     return "\n".join(lines)
-
-
-def _first_last(form: str, tenths: tuple[float, ...]) -> str:
-    return f"{form.format(tenths[0])} → {form.format(tenths[-1])}"
 
 
 def length(metres: float) -> str:

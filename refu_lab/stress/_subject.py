@@ -84,41 +84,23 @@ class Subject:
         return ContactStage(self.pipeline.outfit, sdf=SdfMode.ACCURATE if mode is SdfMode.NONE else mode)
 
     @cached_property
-    def in_float32(self) -> Prediction:
-        """Bodies and garments as the pipeline computes them, without collision handling."""
-        return Prediction(self.pipeline.outfit, torch.float32)
-
-    @cached_property
-    def in_float64(self) -> Prediction:
-        """The same in float64, as the reference for float32."""
-        return Prediction(self.pipeline.outfit, torch.float64)
+    def outfit64(self) -> Outfit:
+        """What the pipeline wears in float64, with its own copy of the networks: the reference for float32."""
+        return self.pipeline.outfit.to(torch.float64)
 
 
-class Prediction:
-    """Body, backbone and posed garment in one precision."""
-
-    def __init__(self, outfit: Outfit, dtype: torch.dtype) -> None:
-        """For the body and garments of `outfit`, with its own copy of the networks."""
-        self._outfit, self._dtype = outfit.to(dtype), dtype
-
-    @torch.no_grad()
-    def __call__(self, frames: Sequence[SmplFrame]) -> list[NDArray[np.floating]]:
-        """The bodies, then each garment before collision handling, in B frames [m], shape (B, V, 3) each."""
-        none = np.zeros(N_STYLES, np.float32)
-        pose, betas, style = (
-            torch.as_tensor(np.stack(values)).to(self._dtype)
-            for values in (
-                [frame.pose for frame in frames],
-                [frame.betas for frame in frames],
-                [none if frame.style is None else frame.style for frame in frames],
-            )
-        )
-        wearer = Wearer.of(self._outfit, betas, style if any(frame.style is not None for frame in frames) else None)
-        dressed = dress(pose, wearer)
-        return [
-            torch.stack([turn(one) for turn, one in zip(dressed.turns, found, strict=True)]).numpy()
-            for found in (dressed.body, *(drape.vertices for drape in dressed.drapes.values()))
-        ]
+@torch.no_grad()
+def predicted(outfit: Outfit, frames: Sequence[SmplFrame]) -> list[NDArray[np.floating]]:
+    """Bodies, then garments before collision handling, in the outfit's precision: B frames [m], (B, V, 3) each."""
+    none = np.zeros(N_STYLES, np.float32)
+    columns = zip(*((f.pose, f.betas, none if f.style is None else f.style) for f in frames), strict=True)
+    pose, betas, style = (torch.as_tensor(np.stack(one)).to(outfit.body.v_template.dtype) for one in columns)
+    wearer = Wearer.of(outfit, betas, style if any(frame.style is not None for frame in frames) else None)
+    dressed = dress(pose, wearer)
+    return [
+        torch.stack([turn(one) for turn, one in zip(dressed.turns, found, strict=True)]).numpy()
+        for found in (dressed.body, *(drape.vertices for drape in dressed.drapes.values()))
+    ]
 
 
 def distance_to_mesh(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,17 +79,13 @@ class Check:
     """Trials in one round."""
     repeats: int = 0
     """Frames that a trial runs in addition to those drawn."""
-    sdf_modes: tuple[str, ...] = ()
-    """Modes that promise it; empty for all."""
+    needs_sdf: bool = False
+    """Whether the mode `none` doesn't promise it."""
 
     @property
     def part(self) -> str:
         """The part it belongs to: numbers, guarantees or invariance."""
         return self.name.partition(":")[0]
-
-    def holds_for(self, wardrobe: Wardrobe) -> bool:
-        """Whether the wardrobe's mode promises it."""
-        return not self.sdf_modes or wardrobe.sdf in self.sdf_modes
 
     def run(self, subject: Subject, trial: Trial) -> Measurement:
         """Measures a trial; a refusal is counted, any other error is a failure."""
@@ -150,12 +146,7 @@ class Tally:
         worst = self.worst or Measurement()
         figures = {"deviation_m": worst.deviation, "limit_m": worst.limit, "worst_share_of_limit": worst.badness}
         return {
-            "case": self.case,
-            "mode": self.mode,
-            "runs": self.runs,
-            "failures": self.failures,
-            "nan": self.nan,
-            "refused": self.refused,
+            **{name: getattr(self, name) for name in ("case", "mode", "runs", "failures", "nan", "refused")},
             "max_deviation_m": self.max_deviation,
             **{name: value if math.isfinite(value) else None for name, value in figures.items()},
             "faults": self.faults,
@@ -165,21 +156,12 @@ class Tally:
 def save_trial(path: Path, check: str, wardrobe: Wardrobe, trial: Trial) -> Path:
     """Writes a trial to `path`, an npz that `load_trial` reads."""
     frames = trial.frames
+    styles = [np.zeros(N_STYLES, np.float32) if frame.style is None else frame.style for frame in frames]
+    told = {"check": check, "seed": np.int64(trial.seed), "style": styles, **asdict(wardrobe)}
+    told |= {name: [getattr(frame, name) for frame in frames] for name in ("pose", "betas", "transl")}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
-        np.savez_compressed(
-            file,
-            check=np.array(check),
-            garments=np.array(wardrobe.garments),
-            backbone=np.array(wardrobe.backbone),
-            sdf=np.array(wardrobe.sdf),
-            pose=np.stack([frame.pose for frame in frames]),
-            betas=np.stack([frame.betas for frame in frames]),
-            transl=np.stack([frame.transl for frame in frames]),
-            style=np.stack([np.zeros(N_STYLES, np.float32) if f.style is None else f.style for f in frames]),
-            has_style=np.array([frame.style is not None for frame in frames]),
-            seed=np.array(trial.seed, np.int64),
-        )
+        np.savez_compressed(file, has_style=np.array([frame.style is not None for frame in frames]), **told)
     return path
 
 
@@ -194,18 +176,11 @@ def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
     if missing:
         msg = f"{path}: not a trial that refu stress has written, it lacks {', '.join(missing)}"
         raise StressError(msg)
-    wardrobe = Wardrobe(
-        garments=tuple(str(name) for name in np.atleast_1d(data["garments"])),
-        backbone=str(data["backbone"]),
-        sdf=str(data["sdf"]),
-    )
+    garments = tuple(map(str, np.atleast_1d(data["garments"])))
+    wardrobe = Wardrobe(garments=garments, backbone=str(data["backbone"]), sdf=str(data["sdf"]))
     try:
-        frames = tuple(
-            SmplFrame(pose=pose, betas=betas, transl=transl, style=style if has_style else None)
-            for pose, betas, transl, style, has_style in zip(
-                *(data[key] for key in ("pose", "betas", "transl", "style", "has_style")), strict=True
-            )
-        )
+        columns = zip(*(data[key] for key in ("pose", "betas", "transl", "style", "has_style")), strict=True)
+        frames = tuple(SmplFrame(p, b, t, style=style if has_style else None) for p, b, t, style, has_style in columns)
         return str(data["check"]), wardrobe, Trial(frames, int(data["seed"]))
     except (RefuError, TypeError, ValueError) as error:
         msg = f"{path}: its frames can't be used: {error}"
