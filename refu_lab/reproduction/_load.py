@@ -36,14 +36,18 @@ class Library:
         """Pickled without the body, which another process loads itself."""
         return partial(Library, collider=self.collider, body=self._named), (self._folders,)
 
-    def find(self, method: Method, garment: str) -> Path:
-        """Path of the weights' files, without suffix. Raises `WeightsError` if there are none."""
-        assert method.weights is not None
-        return self._find(method.weights, garment)
+    def find(self, name: str, garment: str) -> Path:
+        """Path of the files of a garment's weights, without suffix. Raises `WeightsError` if there are none."""
+        for folder in (weights_folder(garment, root) for root in (*self._folders, None)):
+            if (folder / f"{name}.json").exists():
+                return folder / name
+        msg = "not trained"
+        raise WeightsError(msg)
 
     def load(self, method: Method, garment: str) -> Wearable:
         """A method's networks. Raises `WeightsError` if they are missing, damaged or for another body."""
-        stored = load_weights(self.find(method, garment), expect={"garment": garment})
+        assert method.weights is not None
+        stored = load_weights(self.find(method.weights, garment), expect={"garment": garment})
         return wearable_of(stored, load_garment(garment), self.fit)
 
     def pipeline(self, method: Method, *garments: str) -> GarmentPipeline:
@@ -51,7 +55,7 @@ class Library:
 
         Raises `RefuError` if the garments, worn together, don't all have weights in one folder.
         """
-        weights = None if method.weights is None else self.find(method, garments[0]).parent.parent
+        weights = None if method.weights is None else self.find(method.weights, garments[0]).parent.parent
         is_node = method.handling == "node"
         return GarmentPipeline.load(
             garments,
@@ -64,12 +68,5 @@ class Library:
 
     def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:
         """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` if there is none."""
-        stem = self._find(f"sdf-{preset}", garment)
-        return NeuralSdf(load_sdf_network(stem, body).eval().requires_grad_(False), body)
-
-    def _find(self, name: str, garment: str) -> Path:
-        for folder in (weights_folder(garment, root) for root in (*self._folders, None)):
-            if (folder / f"{name}.json").exists():
-                return folder / name
-        msg = "not trained"
-        raise WeightsError(msg)
+        network = load_sdf_network(self.find(f"sdf-{preset}", garment), body)
+        return NeuralSdf(network.eval().requires_grad_(False), body)

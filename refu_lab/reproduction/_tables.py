@@ -124,11 +124,6 @@ class ResultRow(NamedTuple):
     """None if nothing was measured: networks not trained, or no samples for this metric."""
     paper: float | None
 
-    @classmethod
-    def of(cls, table: str, garment: str, method: str, metric: str, value: float | None) -> ResultRow:
-        """A row with the paper's figure looked up."""
-        return cls(table, garment, method, metric, value, paper_figure(table, garment, method, metric))
-
 
 @dataclass(frozen=True)
 class Missing:
@@ -155,6 +150,12 @@ class ResultTable:
     """(file name, caption)."""
     labels: Mapping[str, str] = field(default_factory=dict)
     """Readable names of rows that aren't methods."""
+
+    def add(self, garment: str, method: str, values: Mapping[str, float | None]) -> None:
+        """Adds rows: a method's values by metric, each beside the paper's."""
+        for metric, value in values.items():
+            paper = paper_figure(self.name, garment, method, metric)
+            self.rows.append(ResultRow(self.name, garment, method, metric, value, paper))
 
     def value(self, garment: str, method: str, metric: str) -> float | None:
         """The measured figure; None if there is none."""

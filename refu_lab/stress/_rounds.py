@@ -64,9 +64,7 @@ def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
     has_soak = "soak" in options.parts
     with one_thread():
         subjects = [Subject(one, weights=options.weights, collider=options.collider) for one in wardrobes]
-        pairs = [
-            (check, one) for check in checks for one in subjects if not check.needs_sdf or one.wardrobe.sdf != "none"
-        ]
+        pairs = [(check, one) for check in checks for one in subjects if check.holds_for(one.wardrobe)]
         result.tallies.extend(_run_checks(options, pairs, seconds * (1 - _SOAK_SHARE * has_soak), progress=progress))
         for subject in subjects if has_soak else ():
             share = _SOAK_SHARE if checks else 1.0

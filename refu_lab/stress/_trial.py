@@ -87,6 +87,10 @@ class Check:
         """The part it belongs to: numbers, guarantees or invariance."""
         return self.name.partition(":")[0]
 
+    def holds_for(self, wardrobe: Wardrobe) -> bool:
+        """Whether the wardrobe's mode promises it."""
+        return not self.needs_sdf or wardrobe.sdf != "none"
+
     def run(self, subject: Subject, trial: Trial) -> Measurement:
         """Measures a trial; a refusal is counted, any other error is a failure."""
         n = len(trial.frames) + trial.refused
