@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from refu_core.modes import DEFAULT_MARGIN
 
@@ -68,89 +68,67 @@ _RUN_TIME_SDF: Mapping[str, SdfName] = {"approx": "approx", "accurate": "accurat
 """Hybrid uses the accurate distance in the training loss, the approximate one in ReFU (paper, Sec. "Settings")."""
 
 
+def _methods() -> Iterator[Method]:
+    skinned = Method("skinned", "skinned template (no network)", backbone="skinned", base="skinned")
+    yield skinned
+    for name, mode, handling, label in (
+        ("skinned-naive", "none", "naive", "skinned, naive post-process"),
+        ("skinned-optimisation", "none", "optimisation", "skinned, optimisation post-process"),
+        ("node-skinned", "accurate", "node", "the node, skinned"),
+    ):
+        yield replace(
+            skinned,
+            name=name,
+            label=f"{label}, accurate",
+            mode=mode,
+            handling=cast("Handling", handling),
+            sdf="accurate",
+        )
+    yield Method("tailornet", "backbone alone (TailorNet)")
+    for sdf in _SDFS:
+        drape = Method(f"optimisation-{sdf}", f"optimisation post-process, {sdf}", handling="optimisation", sdf=sdf)
+        yield drape
+        yield _variant(drape, "-margin", ", with ReFU's margin", margin=DEFAULT_MARGIN)
+        yield Method(f"naive-{sdf}", f"naive post-process, {sdf}", handling="naive", sdf=sdf)
+        yield Method(f"collision-loss-{sdf}", f"collision loss, {sdf}", mode=f"collision-{sdf}")
+        if sdf == "approx":
+            for kept, label in (("", ""), ("-kept", " kept everywhere")):
+                label = f", with ReFU's margin{label}, on ReFU hybrid's backbone"
+                on_hybrid = replace(drape, mode="hybrid", margin=DEFAULT_MARGIN, is_kept=bool(kept))
+                yield replace(on_hybrid, name=f"optimisation{kept}-on-hybrid", label=drape.label + label)
+    gcnn = Method("gcnn", "GCNN", backbone="gcnn", base="gcnn")
+    yield gcnn
+    for mode, sdf in _RUN_TIME_SDF.items():
+        refu = Method(f"refu-{mode}", f"ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
+        yield from _ablated(refu, f"bare-{mode}", "bare")
+        yield replace(refu, name=f"node-{mode}", label=f"the node, {mode}", handling="node")
+        yield _variant(gcnn, f"-refu-{mode}", f" with ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
+    for sdf in _SDFS:
+        fixed = Method(f"fixed-{sdf}", f"fixed scale, {sdf}", mode=sdf, folder="fixed", handling="refu", sdf=sdf)
+        yield from _ablated(fixed, f"fixed-bare-{sdf}", "fixed-bare")
+    approx: dict[str, Any] = {"mode": "approx", "handling": "refu", "sdf": "approx"}
+    for n in (1, 2):
+        yield Method(f"alt{n}-approx", f"Alt. {n}, approx", folder=f"alt{n}", **approx)
+    for shapes in SEQUENCE_SHAPES:
+        name, label = f"mlp-{shapes}", f"{shapes} shapes"
+        mlp = Method(name, f"MLP, {label}", backbone="mlp", folder=f"sequence-{shapes}", base=name)
+        yield mlp
+        yield replace(mlp, name=f"{name}-refu-approx", label=f"MLP with ReFU, approx, {label}", **approx)
+
+
 def _variant(of: Method, suffix: str, label: str, **changes: Any) -> Method:
     """A changed method, with `suffix` appended to its name and `label` to its label."""
     return replace(of, name=of.name + suffix, label=of.label + label, **changes)
 
 
-def _skinned() -> Iterator[Method]:
-    alone = Method("skinned", "skinned template (no network)", backbone="skinned", base="skinned")
-    yield alone
-    for handling in ("naive", "optimisation"):
-        label = f"skinned, {handling} post-process, accurate"
-        yield replace(alone, name=f"skinned-{handling}", label=label, handling=handling, sdf="accurate")
-    label = "the node, skinned, accurate"
-    yield replace(alone, name="node-skinned", label=label, mode="accurate", handling="node", sdf="accurate")
-
-
-def _post_processes() -> Iterator[Method]:
-    for sdf in _SDFS:
-        drape = Method(f"optimisation-{sdf}", f"optimisation post-process, {sdf}", handling="optimisation", sdf=sdf)
-        yield Method(f"naive-{sdf}", f"naive post-process, {sdf}", handling="naive", sdf=sdf)
-        yield drape
-        yield _variant(drape, "-margin", ", with ReFU's margin", margin=DEFAULT_MARGIN)
-        yield Method(f"collision-loss-{sdf}", f"collision loss, {sdf}", mode=f"collision-{sdf}")
-    for name, label, is_kept in (("optimisation", "", False), ("optimisation-kept", " kept everywhere", True)):
-        yield Method(
-            f"{name}-on-hybrid",
-            f"optimisation post-process, approx, with ReFU's margin{label}, on ReFU hybrid's backbone",
-            mode="hybrid",
-            handling="optimisation",
-            sdf="approx",
-            margin=DEFAULT_MARGIN,
-            is_kept=is_kept,
-        )
-
-
-def _refu() -> Iterator[Method]:
-    """ReFU as trained; without blending and margin at run time; trained without them (the paper's layer); the node."""
-    for mode, sdf in _RUN_TIME_SDF.items():
-        refu = Method(f"refu-{mode}", f"ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
-        yield from _ablated(refu)
-        yield replace(refu, name=f"node-{mode}", label=f"the node, {mode}", handling="node")
-        yield _trained_bare(refu, f"bare-{mode}", folder="bare")
-    for sdf in _SDFS:
-        fixed = Method(f"fixed-{sdf}", f"fixed scale, {sdf}", mode=sdf, folder="fixed", handling="refu", sdf=sdf)
-        yield from _ablated(fixed)
-        yield _trained_bare(fixed, f"fixed-bare-{sdf}", folder="fixed-bare")
-    for n in (1, 2):
-        label = f"Alt. {n}, approx"
-        yield Method(f"alt{n}-approx", label, mode="approx", folder=f"alt{n}", handling="refu", sdf="approx")
-
-
-def _ablated(whole: Method) -> Iterator[Method]:
+def _ablated(whole: Method, bare: str, folder: str) -> Iterator[Method]:
+    """As trained; without blending and margin at run time; and (`bare`) trained without, in a folder of its own."""
     yield whole
     yield _variant(whole, "-unblended", ", not blended", is_blended=False)
-    yield _variant(whole, "-bare", ", not blended, ε = 0", is_blended=False, margin=0.0)
+    without = _variant(whole, "-bare", ", not blended, ε = 0", is_blended=False, margin=0.0)
+    yield without
+    yield replace(without, name=bare, label=f"{without.label}, trained so (the paper's)", folder=folder, margin=None)
 
 
-def _trained_bare(whole: Method, name: str, *, folder: str) -> Method:
-    """The same method with the weights in `folder`, whose ε is 0 already."""
-    label = f"{whole.label}, not blended, ε = 0, trained so (the paper's)"
-    return replace(whole, name=name, label=label, folder=folder, is_blended=False)
-
-
-def _other_backbones() -> Iterator[Method]:
-    gcnn = Method("gcnn", "GCNN", backbone="gcnn", base="gcnn")
-    yield gcnn
-    for mode, sdf in _RUN_TIME_SDF.items():
-        yield _variant(gcnn, f"-refu-{mode}", f" with ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
-    for shapes in SEQUENCE_SHAPES:
-        name, label = f"mlp-{shapes}", f"{shapes} shapes"
-        mlp = Method(name, f"MLP, {label}", backbone="mlp", folder=f"sequence-{shapes}", base=name)
-        yield mlp
-        with_refu = f"MLP with ReFU, approx, {label}"
-        yield replace(mlp, name=f"{name}-refu-approx", label=with_refu, mode="approx", handling="refu", sdf="approx")
-
-
-METHODS: Mapping[str, Method] = {
-    method.name: method
-    for method in (
-        *_skinned(),
-        Method("tailornet", "backbone alone (TailorNet)"),
-        *_post_processes(),
-        *_refu(),
-        *_other_backbones(),
-    )
-}
+METHODS: Mapping[str, Method] = {method.name: method for method in _methods()}
 """All methods by name."""

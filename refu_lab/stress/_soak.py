@@ -60,15 +60,11 @@ class SoakResult:
 
     def as_dict(self) -> dict[str, Any]:
         """A row of the results, ready for JSON."""
+        row: dict[str, Any] = {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0}
+        row |= {name: getattr(self, name) for name in ("mode", "persons", "nan", "seconds", "failures")}
+        row |= {f"tenths_{name}": values for name, values in self.tenths.items()}
         growths = (("growth", "mb"), ("slowdown", "ms"), ("machine_slowdown", "yardstick_ms"))
-        return {
-            "case": "soak: pipeline",
-            "runs": self.frames,
-            "max_deviation_m": 0.0,
-            **{name: getattr(self, name) for name in ("mode", "persons", "nan", "seconds", "failures")},
-            **{f"tenths_{name}": values for name, values in self.tenths.items()},
-            **{name: self.growth(what) for name, what in growths},
-        }
+        return row | {name: self.growth(what) for name, what in growths}
 
 
 def soak_frames(rng: np.random.Generator) -> list[SmplFrame]:
