@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
+from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow
 from refu_lab.plots import new_axes
 from refu_lab.reproduction import published_modes
 from refu_lab.tables import TextTable, picture_markdown, write_json, write_page
