@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from tqdm import tqdm
 
 import msg_adapters as adapters
 from refu_core import RefuError
-from refu_lab.view._film import Cache, SceneMesh
+from refu_lab.view._film import SceneMesh
 from refu_lab.view._markers import MarkerScene, shows_meshes
 
 _LONGEST_PAUSE_S = 1.0
@@ -25,14 +24,8 @@ _LOOKED_AT = 100
 """Number of marker messages that are searched for a mesh."""
 
 
-@dataclass(frozen=True)
-class _RecordedMesh:
-    name: str
-    person: str
-    color: tuple[float, float, float]
-    faces: NDArray[np.int64]
-    n_vertices: int
-    offset: int
+_Stored = tuple[SceneMesh, slice]
+"""A mesh without its vertices, and where in the temporary file their coordinates are."""
 
 
 class RecordedFilm:
@@ -47,8 +40,8 @@ class RecordedFilm:
         """Warnings for the user."""
         self._spool = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the film)
         self._size = 0
-        scene: MarkerScene[_RecordedMesh] = MarkerScene(self._store)
-        moments: list[tuple[int, list[_RecordedMesh]]] = []
+        scene: MarkerScene[_Stored] = MarkerScene(self._store)
+        moments: list[tuple[int, list[_Stored]]] = []
         stamp_ns = n_bad = n_odd = 0
         with adapters.BagReader(path) as reader:
             topics = {topic.name: topic.message_count for topic in marker_topics(reader)}
@@ -79,7 +72,8 @@ class RecordedFilm:
         self._frames = [shown for _, shown in moments]
         steps = 1e-9 * np.diff([log_time_ns for log_time_ns, _ in moments])
         self._times = np.append(0.0, np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE_S)))
-        self._cache = Cache()
+        self._spool.flush()
+        self._numbers = np.memmap(self._spool, np.float32, "r")
         self.front = _front(path)
 
     @property
@@ -89,7 +83,8 @@ class RecordedFilm:
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
         """What was recorded at a moment."""
-        return self._cache.get(index, self._read)
+        stored = self._frames[index]
+        return [replace(shape, vertices=np.array(self._numbers[place]).reshape(-1, 3)) for shape, place in stored]
 
     def facts(self, index: int) -> list[str]:
         """The number of meshes: nothing else is known."""
@@ -99,25 +94,15 @@ class RecordedFilm:
         """Deletes the temporary file."""
         self._spool.close()
 
-    def _store(self, shape: SceneMesh) -> _RecordedMesh:
-        stored = _RecordedMesh(shape.name, shape.person, shape.color, shape.faces, len(shape.vertices), self._size)
-        data = shape.vertices.tobytes()
+    def _store(self, shape: SceneMesh) -> _Stored:
         try:
-            self._spool.write(data)
+            self._spool.write(shape.vertices.tobytes())
         except OSError as error:
             msg = f"{tempfile.gettempdir()}: no room for what is shown ({error.strerror}); TMPDIR names another folder"
             raise RefuError(msg) from error
-        self._size += len(data)
-        return stored
-
-    def _read(self, index: int) -> Sequence[SceneMesh]:
-        self._spool.flush()
-        found = []
-        for one in self._frames[index]:
-            data = os.pread(self._spool.fileno(), 12 * one.n_vertices, one.offset)
-            vertices = np.frombuffer(data, np.float32).reshape(-1, 3).copy()
-            found.append(SceneMesh(one.name, one.person, vertices, one.faces, one.color))
-        return found
+        place = slice(self._size, self._size + shape.vertices.size)
+        self._size = place.stop
+        return replace(shape, vertices=shape.vertices[:0]), place
 
 
 def marker_topics(reader: adapters.BagReader) -> list[adapters.TopicInfo]:
