@@ -192,8 +192,4 @@ def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) ->
 
 def run_function(function: Callable[[Task], Result]) -> Callable[[], Callable[[Task], Result]]:
     """The argument `make` of an engine, for a function that needs no preparation."""
-    return partial(_itself, function)
-
-
-def _itself(function: Callable[[Task], Result]) -> Callable[[Task], Result]:
-    return function
+    return partial(partial, function)  # gives the function when it is called
