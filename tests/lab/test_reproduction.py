@@ -197,7 +197,7 @@ def test_methods_do_what_their_names_say(study: _runs.Study) -> None:
     # α >= 1 and a margin: no vertex stays inside, and no edge cuts a corner that ε = 0 leaves.
     assert figures["refu-accurate"].vfcp_percent == 0
     assert figures["refu-accurate"].avg_ee < figures["fixed-accurate-bare"].avg_ee
-    assert set(study.runs[GARMENT, "refu-hybrid"].ms) == {"backbone", "sdf", "refu"}
+    assert set(study.runs[GARMENT, "refu-hybrid"].samples[0].ms) == {"backbone", "sdf", "refu"}
     assert study.runs[GARMENT, "optimisation-accurate"].median_ms("post-process") > 0
     assert study.runs[GARMENT, "tailornet"].median_ms("refu") is None
     # Only vertices that the backbone left inside are in the Laplacian error.
