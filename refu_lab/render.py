@@ -44,14 +44,14 @@ _GROUND_STEP, _GROUND_CELLS = 0.022, 400
 _CREASE = math.cos(math.radians(55.0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Viewpoint:
     """An upright pinhole camera in the world of the meshes."""
 
-    eye: tuple[float, float, float]
-    """Position [m]."""
-    target: tuple[float, float, float]
-    """Point in the middle of the picture [m]."""
+    eye: NDArray[np.float64]
+    """Position [m], shape (3,)."""
+    target: NDArray[np.float64]
+    """Point in the middle of the picture [m], shape (3,)."""
     vertical_fov: float = 26.0
     """Angle from the bottom to the top of the picture [degrees]."""
 
@@ -72,8 +72,7 @@ class Viewpoint:
         a, b = math.radians(yaw), math.radians(pitch)
         away = np.array([math.sin(a) * math.cos(b), math.sin(b), math.cos(a) * math.cos(b)])
         centre = np.asarray(target, dtype=np.float64)
-        eye = centre + distance * away
-        return cls(eye=(eye[0], eye[1], eye[2]), target=(centre[0], centre[1], centre[2]), vertical_fov=vertical_fov)
+        return cls(eye=centre + distance * away, target=centre, vertical_fov=vertical_fov)
 
     @classmethod
     def framing(
@@ -94,7 +93,7 @@ class Viewpoint:
         camera = cls.looking_at((points.min(0) + points.max(0)) / 2, distance=1.0, yaw=yaw, pitch=pitch)
         right, up, forward = camera.axes()
         half = math.tan(math.radians(vertical_fov) / 2)
-        centre = np.asarray(camera.target)
+        centre = camera.target
         for _ in range(3):  # because of perspective, centring changes the limits a little
             x, y, depth = ((points - centre) @ axis for axis in (right, up, forward))
             reach = np.maximum(np.abs(y), np.abs(x) * size[1] / size[0]) * margin / half - depth
@@ -105,7 +104,7 @@ class Viewpoint:
 
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Unit vectors to the right and up in the picture and forward into it, each of shape (3,)."""
-        forward = _unit(np.asarray(self.target, dtype=np.float64) - np.asarray(self.eye, dtype=np.float64))
+        forward = _unit(self.target - self.eye)
         right = _unit(np.cross(forward, (0.0, 1.0, 0.0)))
         return right, np.cross(right, forward), forward
 

@@ -122,9 +122,8 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
         )
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
         up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None
-        of_message = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
-        records = _motion_records(motion, INPUT_TOPIC)
-        source = Source(options, description, INPUT_TOPIC, *of_message, records, len(motion))
+        kind, decode = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
+        source = Source(options, description, INPUT_TOPIC, kind, decode, _motion_records(motion), len(motion))
         return replace(source, notes=motion.notes, gender=motion.gender, is_fitted=motion.is_fitted)
     if options.fps is not None or options.input_axes in ("z-up", "y-down"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
@@ -141,7 +140,7 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
     if bag.decoder is None:
         decode = _follower(options, body(), notes)
     else:
-        decode = _decoding(bag.decoder, _up_of(options, bag.decoder))
+        decode = _decoding(bag.decoder, _up_of(options, bag.decoder.input_type))
     found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag, notes)
     return replace(found, frame_id=given) if given and (is_placed or options.axes == "frame") else found
 
@@ -163,19 +162,17 @@ def _frame_of_first(bag: adapters.SmplBag) -> tuple[str, bool]:
         return "", False
 
 
-def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
+def _motion_records(motion: adapters.Motion) -> Iterator[FrameRecord]:
     encode = adapters.encoder_for("multiarray")
     for i in range(len(motion)):
-        stamp_ns = round(1e9 * i / motion.fps)
-        frame, error, raw = None, None, b""
+        found: dict[str, Any] = {"frame": None, "error": None, "raw": b""}
         try:
-            frame = motion.frame(i)
-            raw = encode(frame)
+            found["frame"] = motion.frame(i)
+            found["raw"] = encode(found["frame"])
         except FrameError as cause:  # one bad frame of a clip is skipped like one bad message of a bag
-            error = adapters.DecodeError(str(cause))
-        yield adapters.FrameRecord(
-            frame=frame, error=error, stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=topic, raw=raw
-        )
+            found["error"] = adapters.DecodeError(str(cause))
+        stamp_ns = round(1e9 * i / motion.fps)
+        yield adapters.FrameRecord(stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=INPUT_TOPIC, **found)
 
 
 _Up = Callable[[bytes], "NDArray[np.float64] | None"]
@@ -190,10 +187,8 @@ def _decoding(decoder: adapters.Decoder, up_of_message: _Up) -> Callable[[bytes,
     return decode
 
 
-def _up_of(options: RecordingOptions, decoder: adapters.Decoder) -> _Up:
-    if options.axes == "smpl":
-        return lambda _: None
-    return lambda data: up_of(adapters.frame_id_of(data, decoder.input_type))
+def _up_of(options: RecordingOptions, input_type: str) -> _Up:
+    return lambda data: None if options.axes == "smpl" else up_of(adapters.frame_id_of(data, input_type))
 
 
 def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Callable[[bytes, int], SmplFrame]:

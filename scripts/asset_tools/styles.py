@@ -54,7 +54,7 @@ class _Cut:
         self._sdf = ExactSdf(body.faces)
         self._sdf.update(body.rest_vertices(torch.zeros(1, N_BETAS))[0])
 
-    def normals(self, smoothing: int = 30) -> F64:
+    def normals(self) -> F64:
         """Outward unit normals, smoothed so that a wider cut doesn't deepen the folds of the body under it."""
         a, b, c = (self.x[self.topology.mesh.faces[:, k]] for k in range(3))
         face = np.cross(b - a, c - a)
@@ -62,7 +62,7 @@ class _Cut:
         for k in range(3):
             np.add.at(normal, self.topology.mesh.faces[:, k], face)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        normal = self.smooth(normal, smoothing)
+        normal = self.smooth(normal, 30)
         unit: F64 = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         return unit
 
@@ -84,11 +84,8 @@ class _Cut:
             depth = np.clip(_CLEARANCE - found.distance.numpy(), 0, None)[:, None]
             if not depth.any():
                 break
-            vertices = (
-                vertices
-                + self.smooth(depth * found.gradient.numpy().astype(np.float64), 3)
-                + (0.3 * depth * found.gradient.numpy())
-            )
+            gradient = found.gradient.numpy()
+            vertices = vertices + self.smooth(depth * gradient.astype(np.float64), 3) + (0.3 * depth * gradient)
         return vertices
 
 
