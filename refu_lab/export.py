@@ -237,7 +237,8 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(frames - 1)
     for mesh in meshes:
-        prim = UsdGeom.Mesh.Define(stage, f"/person/{_identifier(mesh.name)}")
+        name = "".join(c if c.isascii() and c.isalnum() else "_" for c in mesh.name)  # as USD requires it
+        prim = UsdGeom.Mesh.Define(stage, f"/person/{'_' * name[:1].isdigit()}{name}")
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateDoubleSidedAttr(True)
         prim.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(mesh.faces)))
@@ -259,9 +260,3 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
     if not stage.GetRootLayer().Export(str(path)):
         msg = f"{path}: can't be written"
         raise RefuError(msg)
-
-
-def _identifier(name: str) -> str:
-    """A name as USD requires it: letters, digits and underscores."""
-    found = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
-    return found if not found[:1].isdigit() else f"_{found}"

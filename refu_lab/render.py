@@ -231,7 +231,9 @@ def render(
         outputs=[image],
         device="cpu",
     )
-    return _to_srgb(image.numpy())
+    linear = np.clip(image.numpy().astype(np.float64), 0.0, 1.0)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(srgb * 255), dtype=np.uint8)
 
 
 def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> list[NDArray[np.float32]]:
@@ -339,9 +341,3 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 def _to_linear(srgb: ArrayLike) -> NDArray[np.float64]:
     value = np.asarray(srgb, dtype=np.float64)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
-def _to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    value = np.clip(linear.astype(np.float64), 0.0, 1.0)
-    srgb = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(srgb * 255), dtype=np.uint8)

@@ -140,7 +140,9 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
     if bag.decoder is None:
         decode = _follower(options, body(), notes)
     else:
-        decode = _decoding(bag.decoder, _up_of(options, bag.decoder.input_type))
+        input_type = bag.decoder.input_type
+        is_smpl = options.axes == "smpl"
+        decode = _decoding(bag.decoder, lambda data: None if is_smpl else up_of(adapters.frame_id_of(data, input_type)))
     found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag, notes)
     return replace(found, frame_id=given) if given and (is_placed or options.axes == "frame") else found
 
@@ -187,10 +189,6 @@ def _decoding(decoder: adapters.Decoder, up_of_message: _Up) -> Callable[[bytes,
     return decode
 
 
-def _up_of(options: RecordingOptions, input_type: str) -> _Up:
-    return lambda data: None if options.axes == "smpl" else up_of(adapters.frame_id_of(data, input_type))
-
-
 def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Callable[[bytes, int], SmplFrame]:
     """Decodes keypoint messages to the frames of one person: `options.person`, or the first one to appear.
 
@@ -235,17 +233,12 @@ def fit_facts(fit: BodyFit) -> dict[str, float]:
 def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
     """Warnings about the body, for a recording of the given `gender` (empty if the recording doesn't say it)."""
     warnings = pipeline.warnings
-    known = _gender_of(pipeline.body.name)
+    # The body's own by its name, like SMPL_FEMALE or basicModel_f_lbs_10_207_0_v1.0.0, where that says one.
+    known = [GENDERS[word] for word in re.split(r"[^a-z]+", pipeline.body.name.lower()) if word in GENDERS][:1]
     said = gender.strip().lower()
-    if said in ("male", "female") and known and said != known:
+    if said in ("male", "female") and known not in ([], [said]):
         warnings.append(
             f"the recording is of a {said} body and is dressed as {pipeline.body.name}: name a body (body, "
             f"--body {said} or a file), and garments are transferred to it"
         )
     return warnings
-
-
-def _gender_of(body: str) -> str:
-    """A body's gender by its name, like `SMPL_FEMALE` or `basicModel_f_lbs_10_207_0_v1.0.0`; empty if it says none."""
-    words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in GENDERS]
-    return GENDERS[words[0]] if words else ""

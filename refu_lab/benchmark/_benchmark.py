@@ -80,8 +80,10 @@ def _measure(options: BenchmarkOptions, result: BenchmarkResult, progress: Calla
 
 def machine_facts(device: str) -> dict[str, Any]:
     """Processor, cores, device and versions as plain values, ready for JSON."""
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    named = (line.partition(":")[2].strip() for line in cpuinfo if line.startswith("model name"))
     facts: dict[str, Any] = {
-        "processor": _processor(),
+        "processor": next(named, platform.machine()),
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
@@ -90,12 +92,6 @@ def machine_facts(device: str) -> dict[str, Any]:
     if torch.device(device).type == "cuda":
         facts["gpu"] = torch.cuda.get_device_name(device)
     return facts
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    named = (line.partition(":")[2].strip() for line in cpuinfo if line.startswith("model name"))
-    return next(named, platform.machine())
 
 
 def accuracies(

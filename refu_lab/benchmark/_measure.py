@@ -91,6 +91,7 @@ def measure(
         progress: Called after every window of a contender.
     """
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in contenders}
+    finish: Callable[[], object] = torch.cuda.synchronize if on_gpu else lambda: None
     names = list(contenders)
     gc.collect()
     gc.disable()  # a collection would charge one contender for the garbage of all
@@ -105,22 +106,16 @@ def measure(
                 if name not in slow:
                     run(window[0])
                 for given in window[1:2] if name in slow else window[1:]:
-                    times[name].append(_timed(run, given, on_gpu=on_gpu))
+                    finish()
+                    wall, cpu = perf_counter(), process_time()
+                    run(given)
+                    finish()
+                    times[name].append((1e3 * (process_time() - cpu), 1e3 * (perf_counter() - wall)))
                 progress()
     finally:
         gc.enable()
     found = {name: np.array(pairs) for name, pairs in times.items()}
     return {name: Timing(pairs[:, 0], pairs[:, 1], on_gpu=on_gpu) for name, pairs in found.items()}
-
-
-def _timed(run: Callable[[Input], object], given: Input, *, on_gpu: bool) -> tuple[float, float]:
-    if on_gpu:
-        torch.cuda.synchronize()
-    wall, cpu = perf_counter(), process_time()
-    run(given)
-    if on_gpu:
-        torch.cuda.synchronize()
-    return 1e3 * (process_time() - cpu), 1e3 * (perf_counter() - wall)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,7 +62,13 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         msg = f"{page}: is there already, and no page of refu evaluate; name another folder with --output"
         raise RefuError(msg)
     sets = [SampleSet.open(path) for path in options.data]
-    _check_sets(sets)
+    kinds = [(samples.garment, samples.shapes) for samples in sets]
+    if twice := [name for name, n in Counter(kinds).items() if n > 1]:
+        msg = f"wanted one data set a garment, got several of {twice[0][0]}"
+        raise RefuError(msg)
+    if unknown := [shapes for _, shapes in kinds if shapes not in (None, *SEQUENCE_SHAPES)]:
+        msg = f"wanted sequences of {' or '.join(map(str, SEQUENCE_SHAPES))} body shapes, got {unknown[0]}"
+        raise RefuError(msg)
     posed = [samples for samples in sets if samples.shapes is None]
     moving = [samples for samples in sets if samples.shapes is not None]
     has_data = {name: bool(posed) for name in RESULT_TABLES}
@@ -114,17 +120,6 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         tables.append(table)
     write_summary(output)
     return tables
-
-
-def _check_sets(sets: Sequence[SampleSet]) -> None:
-    twice = [name for name, n in Counter((samples.garment, samples.shapes) for samples in sets).items() if n > 1]
-    if twice:
-        msg = f"wanted one data set a garment, got several of {twice[0][0]}"
-        raise RefuError(msg)
-    unknown = [samples.shapes for samples in sets if samples.shapes not in (None, *SEQUENCE_SHAPES)]
-    if unknown:
-        msg = f"wanted sequences of {' or '.join(map(str, SEQUENCE_SHAPES))} body shapes, got {unknown[0]}"
-        raise RefuError(msg)
 
 
 def results_text(tables: Sequence[ResultTable], output: Path) -> str:

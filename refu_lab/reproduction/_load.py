@@ -7,12 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from refu_core.body import SmplBody, load_fit
+from refu_core.body import load_fit
 from refu_core.errors import WeightsError
 from refu_core.garments import load_garment
 from refu_core.modes import BackboneName
 from refu_core.realtime import GarmentPipeline, Wearable, wearable_of
-from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
 from refu_core.weights import load_weights, weights_folder
 from refu_lab.reproduction._methods import Method
 
@@ -65,8 +64,3 @@ class Library:
             weights=weights,
             collider=self.collider,
         )
-
-    def load_neural_sdf(self, preset: str, garment: str, body: SmplBody) -> BodySdf:
-        """A distance network trained on a garment's set, `sdf-<preset>`. Raises `WeightsError` if there is none."""
-        network = load_sdf_network(self.find(f"sdf-{preset}", garment), body)
-        return NeuralSdf(network.eval().requires_grad_(False), body)

@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from refu_core.errors import WeightsError
-from refu_core.sdf import BodySdf
+from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
 from refu_core.simulation import posture
 from refu_lab.reproduction._load import Library
 from refu_lab.reproduction._predict import GarmentSetup, SampleScene
@@ -78,7 +78,8 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
         setup = GarmentSetup(garment, library)
         sdfs: dict[str, BodySdf] = {"approx": setup.approx}
         try:
-            sdfs["neural"] = library.load_neural_sdf("paper", garment, setup.body)
+            network = load_sdf_network(library.find("sdf-paper", garment), setup.body)
+            sdfs["neural"] = NeuralSdf(network.eval().requires_grad_(False), setup.body)
         except WeightsError as error:
             command = f"refu train {garment} --data DIR --network sdf --preset paper"
             table.missing.append(Missing(garment, "neural", str(error), command))

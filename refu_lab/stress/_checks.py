@@ -97,7 +97,9 @@ CHECKS: dict[str, Check] = {
     check.name: check
     for check in (
         *(Check(f"numbers: {name}", _many(draw), numbers.against_float64) for name, draw in FRAMES.items()),
-        Check("numbers: collider, everyday", _many(FRAMES["everyday"]), numbers.collider_against_float64),
+        Check(
+            "numbers: collider, everyday", _many(FRAMES["everyday"]), partial(numbers.against_float64, on_collider=True)
+        ),
         *(
             Check(f"numbers: distance, {name}", _calm(0.5), numbers.distances(place))
             for name, place in numbers.POINTS.items()

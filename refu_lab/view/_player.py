@@ -184,9 +184,6 @@ class Player:
             sdf = film.sdf if isinstance(film, DressedFilm) else modes[0]
             self._sdf = gui.add_dropdown("distance", modes, initial_value=sdf, visible=is_dressed)
         self._said = gui.add_markdown("")
-        self._connect()
-
-    def _connect(self) -> None:
         inputs = (self._speed, self._follows, self._body, self._marking, self._wire, self._sdf, *self._boxes.values())
         for one in inputs:
             one.on_update(self._ask)
@@ -217,13 +214,8 @@ def _legend() -> str:
     lines, below = [], 0.0
     for limit, color in CLEARANCE:
         shade = "#" + "".join(f"{round(255 * channel):02x}" for channel in color)
-        what = (
-            "inside"
-            if limit == 0
-            else f"{1e3 * below:g}–{1e3 * limit:g} mm"
-            if limit < np.inf
-            else f"> {1e3 * below:g} mm"
-        )
+        what = f"{1e3 * below:g}–{1e3 * limit:g} mm" if limit < np.inf else f"> {1e3 * below:g} mm"
+        what = what if limit > 0 else "inside"
         lines.append(f'<span style="color:{shade}">■</span> {what}')
         below = limit
     return "  \n".join(lines)
