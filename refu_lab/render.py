@@ -126,15 +126,9 @@ def collision_mesh(
 ) -> RenderMesh:
     """A garment of one sRGB `colour` whose colliding triangles and vertices inside the body are red."""
     colours = np.tile(np.array(colour), (len(vertices), 1))
-    colours[colliding_vertices(faces, found)] = COLLIDING
+    colours[found.inside] = COLLIDING
+    colours[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = COLLIDING
     return RenderMesh(vertices, faces, colours)
-
-
-def colliding_vertices(faces: NDArray[np.int64], found: Collisions) -> NDArray[np.bool_]:
-    """Mask of a garment's vertices that are inside the body or belong to a colliding triangle, shape (V,)."""
-    colliding: NDArray[np.bool_] = found.inside.copy()
-    colliding[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = True
-    return colliding
 
 
 @dataclass(frozen=True)
@@ -236,19 +230,18 @@ def render(
     return np.asarray(np.rint(srgb * 255), dtype=np.uint8)
 
 
-def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> list[NDArray[np.float32]]:
+def sky_light(meshes: Sequence[RenderMesh]) -> list[NDArray[np.float32]]:
     """The share of the sky that the vertices of each mesh see past all meshes, (V,) a mesh.
 
-    Each mesh is its vertices (V, 3) [m] and faces. Covered vertices take the share of their uncovered neighbours, as in
-    a picture.
+    Covered vertices take the share of their uncovered neighbours, as in a picture.
     """
     import warp as wp
 
-    vertices, faces = _joined([RenderMesh(*mesh) for mesh in meshes])
+    vertices, faces = _joined(meshes)
     mesh = wp.Mesh(_array(vertices, wp.vec3), _array(faces.ravel(), wp.int32))
     _, sky = _light(mesh, vertices, _normals(vertices, faces)[1], np.array([0.0, 1.0, 0.0]), sun_rays=1)
     found = _uncovered(sky, sky < _COVERED, faces)
-    return np.split(found, np.cumsum([len(vertices) for vertices, _ in meshes])[:-1])
+    return np.split(found, np.cumsum([len(np.asarray(one.vertices)) for one in meshes])[:-1])
 
 
 def save_png(image: NDArray[np.uint8], path: str | os.PathLike[str]) -> None:
