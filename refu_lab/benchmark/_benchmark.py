@@ -21,8 +21,8 @@ from refu_core import GarmentPipeline, RefuError, WeightsError
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.weights import load_weights, weights_folder
 from refu_lab.benchmark import _sections as sections
-from refu_lab.benchmark._inputs import moments, read_stretches
 from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, one_core
+from refu_lab.benchmark._sdfs import moments, read_stretches
 from refu_lab.commands.benchmark import BenchmarkOptions
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.replay import replay

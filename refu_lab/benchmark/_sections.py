@@ -14,10 +14,9 @@ import torch
 
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_garment
-from refu_lab.benchmark._inputs import EncodedFrame, Window
 from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, Timing, measure, processor_clock
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
-from refu_lab.benchmark._sdfs import PLAIN_QUERY, plain_query, sdf_methods
+from refu_lab.benchmark._sdfs import PLAIN_QUERY, EncodedFrame, Window, plain_query, sdf_methods
 from refu_lab.commands.benchmark import BenchmarkOptions
 
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]

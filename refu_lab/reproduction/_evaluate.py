@@ -21,8 +21,7 @@ from refu_lab.reproduction._build import (
     sample_table,
     time_table,
 )
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import SEQUENCE_SHAPES
+from refu_lab.reproduction._methods import SEQUENCE_SHAPES, Library
 from refu_lab.reproduction._motion import motion_table
 from refu_lab.reproduction._plots import PLOTS, picture_garments
 from refu_lab.reproduction._runs import SampleSet, Study, run_methods

@@ -27,8 +27,7 @@ from refu_core.metrics import (
 )
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import GarmentPipeline, PipelineOutput
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import METHODS
+from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._tables import Missing, ResultTable
 
 OUTFITS = (DEFAULT_GARMENTS, ("shirt-male",), ("skirt-female",))

@@ -15,8 +15,7 @@ from refu_core.metrics import CollisionChecker
 from refu_lab.plots import COLOURS, new_axes, save_svg
 from refu_lab.render import RenderMesh, Viewpoint, collision_mesh, render, save_png
 from refu_lab.reproduction._build import ENERGY_ZOOM, unseen_groups
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import METHODS
+from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._predict import GarmentSetup, Predictor, SampleScene
 from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, SampleSet, Study
 

@@ -21,10 +21,9 @@ from refu_core.frames import SmplFrame
 from refu_core.garments import load_garment, worn_on
 from refu_core.realtime import GarmentPipeline, Outfit, Wearable, Wearer, dress
 from refu_core.refu import Refu, repulse
-from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
+from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, SdfSample
 from refu_lab.baselines import PostProcess
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import Method
+from refu_lab.reproduction._methods import Library, Method
 
 
 class GarmentSetup:
@@ -42,13 +41,8 @@ class GarmentSetup:
             "approx": self.approx.of_garment(self.template),
         }
         """Functions that give the distances of the garment's own vertices."""
-        self.rest_faces = RestFaces(self.body)
         self.post_process = PostProcess(self.template.faces, self.template.n_vertices)
         self.blend = Blend.of_faces(self.template.faces, self.template.n_vertices)
-
-    def near(self, unposed: Tensor, betas: Tensor) -> Tensor:
-        """A body face near each vertex, shape (N,), of an unposed garment [m], shape (N, 3), for betas (1, 10)."""
-        return self.rest_faces.under(unposed[None], betas, self.template.shapedirs)[0]
 
 
 class SampleScene:

@@ -19,8 +19,7 @@ from refu_core.frames import N_STYLES
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
 from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import METHODS
+from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._predict import GarmentSetup, MethodOutput, Predictor, SampleScene
 from refu_lab.reproduction._tables import Missing
 from refu_lab.truth import garments_of, moments_of

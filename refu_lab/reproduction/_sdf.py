@@ -12,9 +12,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from refu_core.errors import WeightsError
-from refu_core.sdf import BodySdf, NeuralSdf, load_sdf_network
+from refu_core.sdf import BodySdf, NeuralSdf, RestFaces, load_sdf_network
 from refu_core.simulation import posture
-from refu_lab.reproduction._load import Library
+from refu_lab.reproduction._methods import Library
 from refu_lab.reproduction._predict import GarmentSetup, SampleScene
 from refu_lab.reproduction._runs import Sample, SampleSet
 from refu_lab.reproduction._tables import Missing, ResultTable
@@ -109,7 +109,7 @@ class _Questions:
     """Asks several distances about a garment on bodies, and keeps their answers."""
 
     def __init__(self, setup: GarmentSetup, sdfs: Mapping[str, BodySdf]) -> None:
-        self._setup, self._sdfs = setup, sdfs
+        self._setup, self._sdfs, self._rest_faces = setup, sdfs, RestFaces(setup.body)
         self._random = np.random.default_rng(0)
         self._asked: dict[str, list[NDArray[np.float32]]] = {name: [] for name in sdfs}
 
@@ -118,8 +118,9 @@ class _Questions:
         disturbance = self._random.normal(scale=DISTURBANCE, size=vertices.shape)
         disturbance[self._random.random(len(disturbance)) < 0.5] = 0
         points = vertices + torch.from_numpy(disturbance.astype(np.float32))
-        unposed = self._setup.template.unpose(points[None], scene.transforms)[0]
-        near = self._setup.near(unposed, scene.betas)
+        template = self._setup.template
+        unposed = template.unpose(points[None], scene.transforms)
+        near = self._rest_faces.under(unposed, scene.betas, template.shapedirs)[0]
         exact, _ = scene.sdf("accurate")
         truth = exact.query(points).distance
         for name, sdf in self._sdfs.items():

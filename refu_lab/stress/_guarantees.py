@@ -21,8 +21,7 @@ from refu_core.modes import DEFAULT_MARGIN
 from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput, Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
 from refu_lab.stress._numbers import n_not_finite
-from refu_lab.stress._subject import Subject
-from refu_lab.stress._trial import Measurement, Trial
+from refu_lab.stress._trial import Measurement, Subject, Trial
 
 DEPTH = 1e-4
 """No vertex may be deeper inside the collider than this [m]."""

@@ -14,8 +14,7 @@ from refu_core.frames import SmplFrame
 from refu_core.realtime import GarmentMesh
 from refu_lab.stress._frames import frame_of
 from refu_lab.stress._numbers import ROUNDING
-from refu_lab.stress._subject import Subject, distance_to_mesh
-from refu_lab.stress._trial import Measurement, Trial
+from refu_lab.stress._trial import Measurement, Subject, Trial, distance_to_mesh
 
 RIGID = 1e-4
 """Largest deviation of a garment that has to follow its person [m]."""

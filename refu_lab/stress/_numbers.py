@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
-from refu_lab.stress._subject import Subject, distance_to_mesh, predicted
-from refu_lab.stress._trial import Measurement, Trial
+from refu_lab.stress._trial import Measurement, Subject, Trial, distance_to_mesh, predicted
 
 ROUNDING = 5e-6
 """Rounding error allowed for float32 on a body of a metre or two [m]: fifty times its resolution there."""

@@ -1,11 +1,11 @@
-"""What a viewer shows: shapes at times, from any source."""
+"""What a viewer shows: meshes of a moment, from any film."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,28 +35,6 @@ class SceneMesh:
     def is_garment(self) -> bool:
         """Whether it is a garment."""
         return self.name not in (BODY, SKIN)
-
-
-class Film(Protocol):
-    """Frames that can be asked for in any order, from one thread."""
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Time of each frame, from the first one on [s], shape (T,), T > 0."""
-
-    @property
-    def title(self) -> str:
-        """What is shown, as a title for the user."""
-
-    @property
-    def front(self) -> float:
-        """Where the first person faces at the beginning: the angle from x towards y [rad]."""
-
-    def shapes(self, index: int) -> Sequence[SceneMesh]:
-        """Everything in a frame; a person who isn't there has no shapes. Raises `RefuError`."""
-
-    def facts(self, index: int) -> list[str]:
-        """Facts about a frame, one a line."""
 
 
 def remembering(make: Callable[[int], Made], *, frame_bytes: int) -> Callable[[int], Made]:

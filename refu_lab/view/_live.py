@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_lab.view._film import SceneMesh
-from refu_lab.view._markers import MarkerScene
+from refu_lab.view._recorded import MarkerScene
 
 TOPICS = ("garments", "body")
 _LOOK_S = 0.2

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     import viser
 
-    from refu_lab.view._film import Film, SceneMesh
+    from refu_lab.view._film import SceneMesh
+    from refu_lab.view._recorded import RecordedFilm
 
 _SPEEDS = {"¼ ×": 0.25, "½ ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
 _HIDDEN = "hidden"
@@ -36,7 +37,7 @@ _IDLE_S = 0.5
 class Player:
     """One film on one server. The thread in `run` does what the panel's callbacks ask for."""
 
-    def __init__(self, server: viser.ViserServer, film: Film) -> None:
+    def __init__(self, server: viser.ViserServer, film: DressedFilm | RecordedFilm | LiveFilm) -> None:
         self._server, self._film = server, film
         self._stage, self._finder = Stage(server), BandFinder()
         self._times = film.times

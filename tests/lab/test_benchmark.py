@@ -13,10 +13,9 @@ import pytest
 import torch
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
-from refu_lab.benchmark._inputs import read_stretches, sdf_frame
 from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, Timing, measure, one_core, processor_clock
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
-from refu_lab.benchmark._sdfs import PLAIN_QUERY, sdf_methods
+from refu_lab.benchmark._sdfs import PLAIN_QUERY, read_stretches, sdf_frame, sdf_methods
 from refu_lab.benchmark._sections import GRAPH, LAUNCHES, Section, frame_runners
 from refu_lab.cli import main
 from refu_lab.commands.benchmark import BenchmarkOptions

@@ -16,7 +16,7 @@ import torch
 from refu_core import GarmentPipeline, PipelineOutput, RefuError, SmplFrame, load_body, load_garment
 from refu_lab.cli import main
 from refu_lab.reproduction import OutfitJudge, _motion, _plots, _runs
-from refu_lab.reproduction._load import Library
+from refu_lab.reproduction._methods import Library
 from refu_lab.reproduction._runs import SampleSet, Study, run_methods
 from refu_lab.truth import moments_of
 

@@ -16,12 +16,20 @@ import pytest
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.realtime import GarmentMesh, PipelineOutput
 from refu_lab.cli import main
-from refu_lab.stress._checks import CHECKS
 from refu_lab.stress._guarantees import _above
-from refu_lab.stress._rounds import length
+from refu_lab.stress._rounds import CHECKS, length
 from refu_lab.stress._soak import SoakResult, resident_mb, soak
-from refu_lab.stress._subject import Subject, Wardrobe
-from refu_lab.stress._trial import Check, Measurement, StressError, Tally, Trial, load_trial, save_trial
+from refu_lab.stress._trial import (
+    Check,
+    Measurement,
+    StressError,
+    Subject,
+    Tally,
+    Trial,
+    Wardrobe,
+    load_trial,
+    save_trial,
+)
 
 SHORTS = Wardrobe(garments=("short-pant-male",))
 """The garment of fewest vertices."""

@@ -32,10 +32,9 @@ from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, PersonMotion
 from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
-from refu_lab.view._markers import MarkerScene, Topology, is_drawable
 from refu_lab.view._marks import CLEARANCE, BandFinder, Marking
 from refu_lab.view._player import Player
-from refu_lab.view._recorded import RecordedFilm
+from refu_lab.view._recorded import MarkerScene, RecordedFilm, Topology, is_drawable
 from refu_lab.view._view import open_film
 
 ROOT = Path(__file__).parents[2]
