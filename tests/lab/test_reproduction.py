@@ -27,7 +27,7 @@ from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, SkinBelow, load_
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import Wearable
 from refu_core.refu import SCALE_PRESETS, Refu
-from refu_lab.reproduction import _build, _load, _methods, _motion, _plots, _runs, _sdf, _tables
+from refu_lab.reproduction import _build, _methods, _motion, _plots, _runs, _sdf, _tables
 from refu_lab.tables import RESULT_TABLES
 
 GARMENT = "short-pant-male"
@@ -94,7 +94,7 @@ class Noisy(WithoutWearerCode):
         return self.amplitude * wave[None, :, None] * torch.tensor([1.0, 0.0, 1.0])
 
 
-class Emulated(_load.Library):
+class Emulated(_methods.Library):
     """Weights of the T-shirt's place that were never trained; some are missing."""
 
     def __init__(self, *, without: tuple[str, ...] = ()) -> None:
@@ -305,7 +305,7 @@ def test_unseen_groups_are_as_large_as_each_other_and_sorted(study: _runs.Study)
 
 
 def test_distance_table(samples: _runs.SampleSet) -> None:
-    table = _sdf.sdf_table([samples], library=_load.Library())
+    table = _sdf.sdf_table([samples], library=_methods.Library())
     assert table.value(GARMENT, "approx", "mean_absolute_mm") < 2
     assert table.value(GARMENT, "approx, within 2 cm", "missed_percent") < 2
     assert table.value(GARMENT, "approx, within 2 cm", "p99_mm") < 1
@@ -385,15 +385,15 @@ def walk() -> Motion:
 
 
 @pytest.fixture(scope="module")
-def library() -> _load.Library:
+def library() -> _methods.Library:
     """The weights that ship; a pipeline is loaded once."""
-    library = _load.Library()
+    library = _methods.Library()
     library.pipeline = functools.cache(library.pipeline)  # type: ignore[method-assign]
     return library
 
 
 @pytest.fixture(scope="module")
-def motion_table(walk: Motion, library: _load.Library) -> _tables.ResultTable:
+def motion_table(walk: Motion, library: _methods.Library) -> _tables.ResultTable:
     short = Motion(walk.poses[3:6], walk.transl[3:6], walk.betas, walk.fps)
     return _motion.motion_table({"long": walk, "short": short}, library=library, every=4)
 
@@ -472,13 +472,13 @@ def test_every_other_person_has_a_shape_of_their_own() -> None:
     assert np.abs(drawn.mean(0)).max() < 0.15
 
 
-def test_motion_of_one_frame_has_no_pair(walk: Motion, library: _load.Library) -> None:
+def test_motion_of_one_frame_has_no_pair(walk: Motion, library: _methods.Library) -> None:
     one = Motion(walk.poses[:1], walk.transl[:1], walk.betas, walk.fps)
     assert _motion.motion_table({"still": one}, library=library, every=1).rows == []
 
 
 def test_shipped_weights_are_found_by_name(tmp_path: Path) -> None:
-    library = _load.Library([tmp_path])
+    library = _methods.Library([tmp_path])
     with pytest.raises(WeightsError, match="not trained"):
         library.find("alt1/tailornet-approx", "tshirt-male")
     (tmp_path / "tshirt-male" / "alt1").mkdir(parents=True)
@@ -489,6 +489,6 @@ def test_shipped_weights_are_found_by_name(tmp_path: Path) -> None:
 
 
 def test_the_node_without_networks_has_none() -> None:
-    (wearable,) = _load.Library().pipeline(_methods.METHODS["node-skinned"], "tshirt-male").outfit.wearables.values()
+    (wearable,) = _methods.Library().pipeline(_methods.METHODS["node-skinned"], "tshirt-male").outfit.wearables.values()
     assert isinstance(wearable.backbone, Skinned)
     assert wearable.refu is None
