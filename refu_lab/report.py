@@ -51,11 +51,8 @@ figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; 
 def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) -> Path:
     """Writes `index.html` and its plots and pictures into `folder`, which is made if it isn't there.
 
-    Returns:
-        The path of the page, which refers only to files in its own folder.
-
-    Raises:
-        RefuError: the folder can't be written.
+    Returns the path of the page, which refers only to files in its own folder. Raises `RefuError`: the folder can't be
+    written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -35,8 +35,7 @@ Key = tuple[str, str]
 def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> BenchmarkResult:
     """Measures everything, pinned to one core.
 
-    Raises:
-        RefuError: no motion, a bag or weights that can't be read, or a process that couldn't be started.
+    Raises `RefuError`: no motion, a bag or weights that can't be read, or a process that couldn't be started.
     """
     result = BenchmarkResult(options.command, options.quick)
     with one_core() as core, tqdm(desc="benchmark", unit="step", disable=None if progress else True) as bar:
@@ -116,10 +115,8 @@ def start_row(
     """Seconds and megabytes of a process that loads two garments and dresses one person.
 
     `first_ever` makes it compile its kernels, as on a machine where nothing has run yet. `unit_ms` is the time of the
-    plain query. Unless both garments have weights, the skinned template is worn.
-
-    Raises:
-        RefuError: the process failed.
+    plain query. Unless both garments have weights, the skinned template is worn. Raises `RefuError`: the process
+    failed.
     """
     sizes = _weights_mb(options, backbone, mode)
     backbone = backbone if len(sizes) == len(DEFAULT_GARMENTS) else "skinned"

@@ -202,8 +202,7 @@ Window = Sequence[EncodedFrame]
 def read_stretches(motions: Path | None, bags: Path, *, count: int, length: int) -> list[Stretch]:
     """`count` stretches of `length` frames at 30 Hz, evenly spread over all the motion there is.
 
-    Raises:
-        RefuError: there is no motion of that length, or a file can't be read.
+    Raises `RefuError`: there is no motion of that length, or a file can't be read.
     """
     starts = [(clip, start) for clip in _clips(motions, bags) for start in range(0, len(clip) - length + 1, length)]
     if not starts:

@@ -138,8 +138,7 @@ PAGE, DATA = "performance.md", "performance.json"
 def write_results(result: BenchmarkResult, folder: Path) -> list[Path]:
     """Writes `performance.md`, `performance.json` and, if errors were measured, the plot; returns their paths.
 
-    Raises:
-        RefuError: the folder can't be written.
+    Raises `RefuError`: the folder can't be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     plot = plot_time_against_error(result, folder)

@@ -43,8 +43,7 @@ class FleetError(RefuError):
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
     """The engine for `jobs` processes on this machine (None or 1: this one alone), or for a Dask scheduler's address.
 
-    Raises:
-        FleetError: Dask isn't installed, both were asked for, or there is no scheduler at the address.
+    Raises `FleetError`: Dask isn't installed, both were asked for, or there is no scheduler at the address.
     """
     if jobs is not None and scheduler is not None:
         msg = "wanted either processes of this machine (--jobs) or a cluster (--scheduler), got both"

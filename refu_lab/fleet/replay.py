@@ -63,11 +63,8 @@ def replay_fleet(
 ) -> FleetResult:
     """Replays the recordings that aren't finished; the row of one that can't be replayed says why.
 
-    An interrupt (Ctrl-C) ends the run early: what is finished is kept and returned.
-
-    Raises:
-        RefuError: options that make no pipeline, a folder that can't be written or that another run writes to, or an
-            engine that can't be reached.
+    An interrupt (Ctrl-C) ends the run early: what is finished is kept and returned. Raises `RefuError`: options that
+    make no pipeline, a folder that can't be written or that another run writes to, or an engine that can't be reached.
     """
     pipeline_for(options.replay)  # options that fail for every recording are reported once, and now
     result = FleetResult(is_kept=(options.output or options.report) is not None)

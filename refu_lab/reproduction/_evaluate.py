@@ -140,11 +140,7 @@ def results_dict(tables: Sequence[ResultTable]) -> dict[str, Any]:
 
 
 def read_clips(folder: Path) -> dict[str, adapters.Motion]:
-    """A folder's AMASS-style motions, by name.
-
-    Raises:
-        RefuError: there is no motion, or one can't be read.
-    """
+    """A folder's AMASS-style motions, by name. Raises `RefuError`: there is no motion, or one can't be read."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         msg = f"{folder}: no motion in it, wanted AMASS-style .npz files"

@@ -70,9 +70,8 @@ class SampleSet:
     def open(cls, path: Path) -> SampleSet:
         """The test samples finished so far of the set in the folder `path`, or the samples of a bag with ground truth.
 
-        Raises:
-            RefuError: no such set or bag, a damaged one, one without a finished test sample, or a bag whose truth isn't
-                of one garment.
+        Raises `RefuError`: no such set or bag, a damaged one, one without a finished test sample, or a bag whose truth
+        isn't of one garment.
         """
         if any(one.suffix in BAG_SUFFIXES for one in (path, *path.glob("*"))):
             return _of_bag(path)

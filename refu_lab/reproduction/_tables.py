@@ -219,10 +219,8 @@ class ResultTable:
     def write(self, folder: Path, *, command: str, n_samples: Mapping[str, int]) -> Path:
         """Writes `<name>.md` and `<name>.json`; returns the page.
 
-        `command` makes the table again; `n_samples` are the numbers of test samples that it is based on.
-
-        Raises:
-            RefuError: the folder can't be written.
+        `command` makes the table again; `n_samples` are the numbers of test samples that it is based on. Raises
+        `RefuError`: the folder can't be written.
         """
         counted = ", ".join(f"{name} {count}" for name, count in n_samples.items())
         of_samples = f" over these numbers of test samples: {counted}" if counted else ""
@@ -244,11 +242,7 @@ class ResultTable:
 
 
 def read_table(folder: Path, name: str) -> ResultTable | None:
-    """Reads a table that was written; None if there is none.
-
-    Raises:
-        RefuError: a file that isn't such a table.
-    """
+    """Reads a table that was written; None if there is none. Raises `RefuError`: a file that isn't such a table."""
     path = folder / f"{name}.json"
     if not path.exists():
         return None
@@ -275,10 +269,8 @@ def is_summary(page: Path) -> bool:
 def write_summary(folder: Path) -> Path:
     """Writes `README.md`: links to all tables in the folder, the main one's figures, and the pictures.
 
-    A text about the folder as a whole is taken from its `about.txt`.
-
-    Raises:
-        RefuError: a file that isn't a table, or a folder that can't be written.
+    A text about the folder as a whole is taken from its `about.txt`. Raises `RefuError`: a file that isn't a table, or
+    a folder that can't be written.
     """
     tables: dict[str, Any] = {name: read_table(folder, name) for name in RESULT_TABLES}
     links = [

@@ -185,9 +185,8 @@ class StressResult:
 def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
     """Runs everything that the options ask for.
 
-    Raises:
-        StressError: there is nothing to try: no such part, or no weights of any garment.
-        RefuError: as `GarmentPipeline.load`.
+    Raises `StressError`: there is nothing to try: no such part, or no weights of any garment; `RefuError`: as
+    `GarmentPipeline.load`.
     """
     wardrobes, left_out = _wardrobes(options)
     result = StressResult(left_out=left_out)
@@ -271,9 +270,7 @@ def _save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:
 def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = True) -> Tally:
     """Runs a trial again that `refu stress` has saved.
 
-    Raises:
-        StressError: the file can't be read, or its check doesn't exist.
-        RefuError: as `GarmentPipeline.load`.
+    Raises `StressError`: the file can't be read, or its check doesn't exist; `RefuError`: as `GarmentPipeline.load`.
     """
     name, wardrobe, trial = load_trial(path)
     if name not in CHECKS:

@@ -87,10 +87,8 @@ def soak(
     """Runs the same motions over and over, until `frames` or `seconds` are reached, and measures each tenth of the run.
 
     Each of the `persons` in a call has their own motion and counts as a frame; `tick` is called with the number of
-    frames after each call. After an interrupt (Ctrl-C) the tenths are those of the run so far.
-
-    Raises:
-        StressError: `frames` give fewer than ten calls, which have no tenths.
+    frames after each call. After an interrupt (Ctrl-C) the tenths are those of the run so far. Raises `StressError`:
+    `frames` give fewer than ten calls, which have no tenths.
     """
     calls = -(-frames // persons)
     if calls < _FEWEST:

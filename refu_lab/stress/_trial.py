@@ -303,8 +303,7 @@ def save_trial(path: Path, check: str, wardrobe: Wardrobe, trial: Trial) -> Path
 def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
     """The check's name, the wardrobe and the trial in a file that `save_trial` wrote.
 
-    Raises:
-        StressError: the file is missing, damaged or something else.
+    Raises `StressError`: the file is missing, damaged or something else.
     """
     data = read_npz(path, keys=_KEYS, error=StressError, wanted="a trial that refu stress has written")
     missing = [key for key in _KEYS if key not in data]
