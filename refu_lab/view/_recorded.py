@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -16,7 +17,6 @@ from tqdm import tqdm
 
 import msg_adapters as adapters
 from msg_adapters import Marker, decode_marker_array
-from msg_adapters.errors import DecodeError
 from msg_adapters.markers import ADD, DELETE, DELETE_ALL, TRIANGLE_LIST
 from refu_core import RefuError
 from refu_lab.view._film import SceneMesh
@@ -117,14 +117,6 @@ class MarkerScene(Generic[_Kept]):
         return SceneMesh(name, person, (vertices - self._origin).astype(np.float32), topology.faces, color)
 
 
-def shows_meshes(data: bytes) -> bool:
-    """Whether a message has a mesh that can be drawn."""
-    try:
-        return any(is_mesh(marker) and is_drawable(marker) for marker in decode_marker_array(data))
-    except DecodeError:
-        return False
-
-
 _LONGEST_PAUSE_S = 1.0
 """Longer pauses, as between the runs in a bag, are cut to this [s]."""
 _LOOKED_AT = 100
@@ -220,8 +212,11 @@ def marker_topics(reader: adapters.BagReader) -> list[adapters.TopicInfo]:
 def has_meshes(path: Path) -> bool:
     """Whether a bag's markers show meshes, as those of garments do. Raises `BagError` if it isn't a bag."""
     with adapters.BagReader(path) as reader:
-        first = islice(reader.messages({topic.name for topic in marker_topics(reader)}), _LOOKED_AT)
-        return any(shows_meshes(message.data) for message in first)
+        for message in islice(reader.messages({topic.name for topic in marker_topics(reader)}), _LOOKED_AT):
+            with suppress(adapters.DecodeError):
+                if any(is_mesh(marker) and is_drawable(marker) for marker in decode_marker_array(message.data)):
+                    return True
+    return False
 
 
 def _front(path: Path) -> float:
