@@ -50,33 +50,22 @@ class PostProcess:
             reach: Vertices nearer to the skin than this are also brought to `clearance` [m]. DRAPE's is 0: it moves
                 only those inside, and edges between others may still cut through the body.
         """
+        n = self._laplacian.shape[0]
         for smoothness, damping in DRAPE_ROUNDS:
             sample = ask(points)
-            rows = torch.nonzero(sample.distance < reach)[:, 0]
-            if not len(rows):
+            inside = torch.nonzero(sample.distance < reach)[:, 0]
+            if not len(inside):
                 break
-            found = sample.rows(rows)
+            found = sample.rows(inside)
             normal, distance = (x.double().cpu().numpy() for x in (found.gradient, found.distance))
-            deficit = clearance - distance
-            points = points + self._drape_round(rows.cpu().numpy(), normal, deficit, smoothness, damping).to(points)
+            # nᵀ(y - b) - ε = nᵀu - (ε - f) for the displacement u: one row for each vertex inside, three columns each.
+            columns = 3 * inside.cpu().numpy()[:, None] + np.arange(3)
+            rows = np.repeat(np.arange(len(inside)), 3)
+            push = coo_array((normal.ravel(), (rows, columns.ravel())), shape=(len(inside), 3 * n)).tocsr()
+            smooth = self._laplacian.T @ self._laplacian * smoothness + damping * eye_array(n)
+            # Damping bounds the condition number by about 40: conjugate gradients converge without a factorisation.
+            matrix, wanted = push.T @ push + kron(smooth, eye_array(3)), push.T @ (clearance - distance)
+            solution, failed = cg(matrix, wanted, rtol=1e-8, maxiter=1000)
+            assert not failed
+            points = points + torch.from_numpy(solution.reshape(n, 3)).to(points)
         return points
-
-    def _drape_round(
-        self,
-        inside: NDArray[np.int64],
-        normal: NDArray[np.float64],
-        deficit: NDArray[np.float64],
-        smoothness: float,
-        damping: float,
-    ) -> Tensor:
-        """The displacement y - ỹ that solves one round, shape (N, 3)."""
-        n = self._laplacian.shape[0]
-        # nᵀ(y - b) - ε = nᵀu - (ε - f) for the displacement u: one row for each vertex inside, three columns each.
-        columns = 3 * inside[:, None] + np.arange(3)
-        rows = np.repeat(np.arange(len(inside)), 3)
-        push = coo_array((normal.ravel(), (rows, columns.ravel())), shape=(len(inside), 3 * n)).tocsr()
-        smooth = self._laplacian.T @ self._laplacian * smoothness + damping * eye_array(n)
-        # Damping bounds the condition number by about 40, so conjugate gradients converge without a factorisation.
-        solution, failed = cg(push.T @ push + kron(smooth, eye_array(3)), push.T @ deficit, rtol=1e-8, maxiter=1000)
-        assert not failed
-        return torch.from_numpy(solution.reshape(n, 3))

@@ -79,13 +79,8 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
 
     OBJ and USD keep the vertex order and store texture coordinates separately. GLB has one texture coordinate a vertex,
     so vertices on texture seams are there twice. GLB and USD have numbers of seven digits: meshes farther than `_FAR`
-    from the origin are stored relative to their first place, and their node moves them there.
-
-    Returns:
-        The files.
-
-    Raises:
-        RefuError: another suffix, no frame, a missing package, or a file that can't be written.
+    from the origin are stored relative to their first place, and their node moves them there. Returns the files. Raises
+    `RefuError`: another suffix, no frame, a missing package, or a file that can't be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -120,11 +115,8 @@ def export(
     """What `refu export` does: writes some frames of a bag or motion file, dressed; returns the files and the warnings.
 
     Frames are numbered as they were recorded; those that can't be read are left out, and a warning says so. Whatever
-    the input's axes are, y is up in the files.
-
-    Raises:
-        RefuError: as `write_meshes`; a file that is there already, unless `overwrite`; options that make no pipeline,
-            an input that can't be read, or no frame.
+    the input's axes are, y is up in the files. Raises `RefuError`: as `write_meshes`; a file that is there already,
+    unless `overwrite`; options that make no pipeline, an input that can't be read, or no frame.
     """
     from refu_lab.sources import open_source
 
@@ -237,7 +229,8 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(frames - 1)
     for mesh in meshes:
-        prim = UsdGeom.Mesh.Define(stage, f"/person/{_identifier(mesh.name)}")
+        name = "".join(c if c.isascii() and c.isalnum() else "_" for c in mesh.name)  # as USD requires it
+        prim = UsdGeom.Mesh.Define(stage, f"/person/{'_' * name[:1].isdigit()}{name}")
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateDoubleSidedAttr(True)
         prim.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(mesh.faces)))
@@ -259,9 +252,3 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
     if not stage.GetRootLayer().Export(str(path)):
         msg = f"{path}: can't be written"
         raise RefuError(msg)
-
-
-def _identifier(name: str) -> str:
-    """A name as USD requires it: letters, digits and underscores."""
-    found = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)
-    return found if not found[:1].isdigit() else f"_{found}"

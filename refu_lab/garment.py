@@ -154,11 +154,8 @@ def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
         left = checker.check(mesh.local, mesh.faces)
         rest = made.template.v_template.double().numpy()
         long = stretch(made.template.faces.numpy(), rest, mesh.local.astype(np.float64))
-        found[pose_name] = {
-            "inside": left.n_inside,
-            "pairs": left.n_pairs,
-            "stretch": float(np.quantile(long, 0.999)),
-        }
+        stretched = float(np.quantile(long, 0.999))
+        found[pose_name] = {"inside": left.n_inside, "pairs": left.n_pairs, "stretch": stretched}
     return found
 
 
@@ -195,11 +192,10 @@ def list_garments() -> list[dict[str, Any]]:
         except GarmentError as error:
             rows.append({**row, "fault": str(error)})
             continue
-        networks = sorted(file.stem for file in weights_folder(name).glob("*-hybrid.json"))
         row |= {"body": template.body, "layer": template.card.layer, "vertices": template.n_vertices}
-        rows.append(
-            {**row, "styles": template.styledirs is not None, "uv": template.uv is not None, "networks": networks}
-        )
+        row |= {"styles": template.styledirs is not None, "uv": template.uv is not None}
+        row["networks"] = sorted(file.stem for file in weights_folder(name).glob("*-hybrid.json"))
+        rows.append(row)
     return rows
 
 

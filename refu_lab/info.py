@@ -42,33 +42,23 @@ def describe_body(source: str) -> dict[str, Any]:
 
 
 def describe_garment(name: str) -> str:
-    """What a named garment's file holds, or why it can't be loaded."""
+    """What a named garment's file holds and what its networks were trained from, or why it can't be loaded."""
+    stem, networks = weights_folder(name) / "tailornet-hybrid", "no networks: worn by skinning"
     try:
         found = load_garment(name)
-        networks = networks_of(name)
+        if stem.with_suffix(".json").exists():
+            card = load_card(stem)
+            networks = "networks" + (f" of {card['like']} and {card['simulated']} samples" if "like" in card else "")
     except RefuError as error:
         return f"can't be loaded: {error}"
     return f"{found.n_vertices} vertices, {len(found.faces)} faces, for {found.body}; {networks}"
-
-
-def networks_of(garment: str) -> str:
-    """What the shipped networks of a garment were trained from; raises `WeightsError` if their card is damaged."""
-    stem = weights_folder(garment) / "tailornet-hybrid"
-    if not stem.with_suffix(".json").exists():
-        return "no networks: worn by skinning"
-    card = load_card(stem)
-    if "like" in card:
-        return f"networks of {card['like']} and {card['simulated']} samples"
-    return "networks"
 
 
 def collect() -> dict[str, Any]:
     """Versions, bodies, garments, modes and devices as plain values, ready for JSON."""
     import torch
 
-    cuda = (
-        [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
-    )
+    n_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     bodies = (load_body(name) for name in BUILTIN_BODIES)
     return {
         "refu": __version__,
@@ -76,7 +66,7 @@ def collect() -> dict[str, Any]:
         "machine": f"{platform.system()} {platform.machine()}",
         **{name: installed(name) for name in ("torch", "warp-lang", "numpy")},
         "rclpy": "importable" if find_spec("rclpy") else "not found (needed by the node only)",
-        "devices": ["cpu", *(f"cuda: {name}" for name in cuda)],
+        "devices": ["cpu", *(f"cuda: {torch.cuda.get_device_name(i)}" for i in range(n_gpus))],
         "bodies": {body.name: f"{body.n_vertices} vertices, {body.fingerprint}" for body in bodies},
         "garments": {name: describe_garment(name) for name in garment_files()},
         "backbones": [str(one) for one in BackboneName],

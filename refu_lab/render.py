@@ -44,14 +44,14 @@ _GROUND_STEP, _GROUND_CELLS = 0.022, 400
 _CREASE = math.cos(math.radians(55.0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Viewpoint:
     """An upright pinhole camera in the world of the meshes."""
 
-    eye: tuple[float, float, float]
-    """Position [m]."""
-    target: tuple[float, float, float]
-    """Point in the middle of the picture [m]."""
+    eye: NDArray[np.float64]
+    """Position [m], shape (3,)."""
+    target: NDArray[np.float64]
+    """Point in the middle of the picture [m], shape (3,)."""
     vertical_fov: float = 26.0
     """Angle from the bottom to the top of the picture [degrees]."""
 
@@ -72,8 +72,7 @@ class Viewpoint:
         a, b = math.radians(yaw), math.radians(pitch)
         away = np.array([math.sin(a) * math.cos(b), math.sin(b), math.cos(a) * math.cos(b)])
         centre = np.asarray(target, dtype=np.float64)
-        eye = centre + distance * away
-        return cls(eye=(eye[0], eye[1], eye[2]), target=(centre[0], centre[1], centre[2]), vertical_fov=vertical_fov)
+        return cls(eye=centre + distance * away, target=centre, vertical_fov=vertical_fov)
 
     @classmethod
     def framing(
@@ -94,7 +93,7 @@ class Viewpoint:
         camera = cls.looking_at((points.min(0) + points.max(0)) / 2, distance=1.0, yaw=yaw, pitch=pitch)
         right, up, forward = camera.axes()
         half = math.tan(math.radians(vertical_fov) / 2)
-        centre = np.asarray(camera.target)
+        centre = camera.target
         for _ in range(3):  # because of perspective, centring changes the limits a little
             x, y, depth = ((points - centre) @ axis for axis in (right, up, forward))
             reach = np.maximum(np.abs(y), np.abs(x) * size[1] / size[0]) * margin / half - depth
@@ -105,7 +104,7 @@ class Viewpoint:
 
     def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Unit vectors to the right and up in the picture and forward into it, each of shape (3,)."""
-        forward = _unit(np.asarray(self.target, dtype=np.float64) - np.asarray(self.eye, dtype=np.float64))
+        forward = _unit(self.target - self.eye)
         right = _unit(np.cross(forward, (0.0, 1.0, 0.0)))
         return right, np.cross(right, forward), forward
 
@@ -127,15 +126,9 @@ def collision_mesh(
 ) -> RenderMesh:
     """A garment of one sRGB `colour` whose colliding triangles and vertices inside the body are red."""
     colours = np.tile(np.array(colour), (len(vertices), 1))
-    colours[colliding_vertices(faces, found)] = COLLIDING
+    colours[found.inside] = COLLIDING
+    colours[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = COLLIDING
     return RenderMesh(vertices, faces, colours)
-
-
-def colliding_vertices(faces: NDArray[np.int64], found: Collisions) -> NDArray[np.bool_]:
-    """Mask of a garment's vertices that are inside the body or belong to a colliding triangle, shape (V,)."""
-    colliding: NDArray[np.bool_] = found.inside.copy()
-    colliding[faces[np.unique(found.pairs[:, 0])].reshape(-1)] = True
-    return colliding
 
 
 @dataclass(frozen=True)
@@ -232,22 +225,23 @@ def render(
         outputs=[image],
         device="cpu",
     )
-    return _to_srgb(image.numpy())
+    linear = np.clip(image.numpy().astype(np.float64), 0.0, 1.0)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(srgb * 255), dtype=np.uint8)
 
 
-def sky_light(meshes: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]]) -> list[NDArray[np.float32]]:
+def sky_light(meshes: Sequence[RenderMesh]) -> list[NDArray[np.float32]]:
     """The share of the sky that the vertices of each mesh see past all meshes, (V,) a mesh.
 
-    Each mesh is its vertices (V, 3) [m] and faces. Covered vertices take the share of their uncovered neighbours, as in
-    a picture.
+    Covered vertices take the share of their uncovered neighbours, as in a picture.
     """
     import warp as wp
 
-    vertices, faces = _joined([RenderMesh(*mesh) for mesh in meshes])
+    vertices, faces = _joined(meshes)
     mesh = wp.Mesh(_array(vertices, wp.vec3), _array(faces.ravel(), wp.int32))
     _, sky = _light(mesh, vertices, _normals(vertices, faces)[1], np.array([0.0, 1.0, 0.0]), sun_rays=1)
     found = _uncovered(sky, sky < _COVERED, faces)
-    return np.split(found, np.cumsum([len(vertices) for vertices, _ in meshes])[:-1])
+    return np.split(found, np.cumsum([len(np.asarray(one.vertices)) for one in meshes])[:-1])
 
 
 def save_png(image: NDArray[np.uint8], path: str | os.PathLike[str]) -> None:
@@ -340,9 +334,3 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 def _to_linear(srgb: ArrayLike) -> NDArray[np.float64]:
     value = np.asarray(srgb, dtype=np.float64)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
-def _to_srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
-    value = np.clip(linear.astype(np.float64), 0.0, 1.0)
-    srgb = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(srgb * 255), dtype=np.uint8)

@@ -221,11 +221,9 @@ def replay(
     `pipeline` is the result of `options.load_pipeline()`, if that was called already. `progress` shows a bar. `told` is
     called a few times a second with how many frames are done, and of how many (0 where that isn't known).
 
-    An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned.
-
-    Raises:
-        RefuError: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
-            replayed.
+    An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned. Raises
+    `RefuError`: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
+    replayed.
     """
     if options.output is not None:
         require_apart(options.input, options.output)

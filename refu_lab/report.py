@@ -15,11 +15,11 @@ from refu_core._files import replacing
 from refu_core.metrics import CollisionChecker
 from refu_core.recordings import upright_turn
 from refu_lab.plots import new_axes, save_svg
-from refu_lab.render import SKIN, RenderMesh, Viewpoint, colliding_vertices, collision_mesh, render, save_png
+from refu_lab.render import SKIN, RenderMesh, Viewpoint, collision_mesh, render, save_png
 from refu_lab.replay import Findings, FrameResult, ReplayResult, When
 from refu_lab.tables import REPLAY_TITLE, html_page, html_table, meanings, replay_columns
 from refu_lab.turntable import STYLE as TURNTABLE_STYLE
-from refu_lab.turntable import Frame, Mesh, MeshInFrame, turntable
+from refu_lab.turntable import Frame, turntable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -51,11 +51,8 @@ figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; 
 def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) -> Path:
     """Writes `index.html` and its plots and pictures into `folder`, which is made if it isn't there.
 
-    Returns:
-        The path of the page, which refers only to files in its own folder.
-
-    Raises:
-        RefuError: the folder can't be written.
+    Returns the path of the page, which refers only to files in its own folder. Raises `RefuError`: the folder can't be
+    written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -119,8 +116,7 @@ def _draw_frames(
     chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
     body_faces = pipeline.body.faces.cpu().numpy()
     checker = CollisionChecker(body_faces)
-    meshes = [Mesh("body", body_faces, SKIN)]
-    meshes += [Mesh(name, one.faces.cpu().numpy(), one.card.color) for name, one in pipeline.garments.items()]
+    colours = {"body": SKIN, **{name: one.card.color for name, one in pipeline.garments.items()}}
     frames = []
     start = result.frames[0].frame.stamp_ns
     # Frames may come in axes of their own (a camera's, or z up); the pictures have y up.
@@ -136,19 +132,17 @@ def _draw_frames(
             title = f"{name.capitalize()} frame, number {index}, {1e-9 * (frame.frame.stamp_ns - start):.2f} s"
             poses = []
             for when in ("before", "after"):
-                drawn, posed = [RenderMesh(body, body_faces)], [MeshInFrame(body)]
+                drawn = [RenderMesh(body, body_faces)]
                 for garment, mesh in output.items():
                     vertices = mesh.raw if when == "before" else mesh.local
                     found = checker.check(vertices, mesh.faces)
-                    colour = pipeline.garments[garment].card.color
-                    drawn.append(collision_mesh(vertices @ turn.T, mesh.faces, found, colour=colour))
-                    posed.append(MeshInFrame(vertices @ turn.T, colliding_vertices(mesh.faces, found)))
+                    drawn.append(collision_mesh(vertices @ turn.T, mesh.faces, found, colour=colours[garment]))
                 save_png(render(drawn, camera=camera, size=_PICTURE), folder / f"{name}_{when}.png")
-                poses.append(posed)
+                poses.append(drawn)
                 bar.update()
             captions = _caption(frame, "before"), _caption(frame, "after")
             frames.append(Frame(name, title, poses[0], poses[1], *captions, yaw))
-    return frames, turntable(meshes, frames)
+    return frames, turntable(colours, frames)
 
 
 def _front(frame: FrameResult, turn: NDArray[np.float32]) -> float:

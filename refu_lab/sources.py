@@ -122,9 +122,8 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
         )
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
         up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None
-        of_message = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
-        records = _motion_records(motion, INPUT_TOPIC)
-        source = Source(options, description, INPUT_TOPIC, *of_message, records, len(motion))
+        kind, decode = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
+        source = Source(options, description, INPUT_TOPIC, kind, decode, _motion_records(motion), len(motion))
         return replace(source, notes=motion.notes, gender=motion.gender, is_fitted=motion.is_fitted)
     if options.fps is not None or options.input_axes in ("z-up", "y-down"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
@@ -141,7 +140,9 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
     if bag.decoder is None:
         decode = _follower(options, body(), notes)
     else:
-        decode = _decoding(bag.decoder, _up_of(options, bag.decoder))
+        input_type = bag.decoder.input_type
+        is_smpl = options.axes == "smpl"
+        decode = _decoding(bag.decoder, lambda data: None if is_smpl else up_of(adapters.frame_id_of(data, input_type)))
     found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag, notes)
     return replace(found, frame_id=given) if given and (is_placed or options.axes == "frame") else found
 
@@ -163,19 +164,17 @@ def _frame_of_first(bag: adapters.SmplBag) -> tuple[str, bool]:
         return "", False
 
 
-def _motion_records(motion: adapters.Motion, topic: str) -> Iterator[FrameRecord]:
+def _motion_records(motion: adapters.Motion) -> Iterator[FrameRecord]:
     encode = adapters.encoder_for("multiarray")
     for i in range(len(motion)):
-        stamp_ns = round(1e9 * i / motion.fps)
-        frame, error, raw = None, None, b""
+        found: dict[str, Any] = {"frame": None, "error": None, "raw": b""}
         try:
-            frame = motion.frame(i)
-            raw = encode(frame)
+            found["frame"] = motion.frame(i)
+            found["raw"] = encode(found["frame"])
         except FrameError as cause:  # one bad frame of a clip is skipped like one bad message of a bag
-            error = adapters.DecodeError(str(cause))
-        yield adapters.FrameRecord(
-            frame=frame, error=error, stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=topic, raw=raw
-        )
+            found["error"] = adapters.DecodeError(str(cause))
+        stamp_ns = round(1e9 * i / motion.fps)
+        yield adapters.FrameRecord(stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=INPUT_TOPIC, **found)
 
 
 _Up = Callable[[bytes], "NDArray[np.float64] | None"]
@@ -188,12 +187,6 @@ def _decoding(decoder: adapters.Decoder, up_of_message: _Up) -> Callable[[bytes,
         return frame if up is None else replace(frame, up=up)
 
     return decode
-
-
-def _up_of(options: RecordingOptions, decoder: adapters.Decoder) -> _Up:
-    if options.axes == "smpl":
-        return lambda _: None
-    return lambda data: up_of(adapters.frame_id_of(data, decoder.input_type))
 
 
 def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Callable[[bytes, int], SmplFrame]:
@@ -240,17 +233,12 @@ def fit_facts(fit: BodyFit) -> dict[str, float]:
 def body_warnings(pipeline: GarmentPipeline, *, gender: str = "") -> list[str]:
     """Warnings about the body, for a recording of the given `gender` (empty if the recording doesn't say it)."""
     warnings = pipeline.warnings
-    known = _gender_of(pipeline.body.name)
+    # The body's own by its name, like SMPL_FEMALE or basicModel_f_lbs_10_207_0_v1.0.0, where that says one.
+    known = [GENDERS[word] for word in re.split(r"[^a-z]+", pipeline.body.name.lower()) if word in GENDERS][:1]
     said = gender.strip().lower()
-    if said in ("male", "female") and known and said != known:
+    if said in ("male", "female") and known not in ([], [said]):
         warnings.append(
             f"the recording is of a {said} body and is dressed as {pipeline.body.name}: name a body (body, "
             f"--body {said} or a file), and garments are transferred to it"
         )
     return warnings
-
-
-def _gender_of(body: str) -> str:
-    """A body's gender by its name, like `SMPL_FEMALE` or `basicModel_f_lbs_10_207_0_v1.0.0`; empty if it says none."""
-    words = [word for word in re.split(r"[^a-z]+", body.lower()) if word in GENDERS]
-    return GENDERS[words[0]] if words else ""

@@ -117,9 +117,8 @@ def replay_table(result: ReplayResult) -> str:
         f" ({result.options.backbone} backbone, {result.options.sdf} signed distance, {result.options.device})"
     )
     if result.options.collider:
-        shift = result.skin_shift_mm()
-        mean, largest = shift["mean"], shift["largest"]
-        lines.append(f"skin moved to be free of itself: {mean:.2f} mm on average, {largest:.1f} mm at most")
+        moved = "skin moved to be free of itself: {mean:.2f} mm on average, {largest:.1f} mm at most"
+        lines.append(moved.format(**result.skin_shift_mm()))
     lines += [f"skipped {count} x {reason}" for reason, count in result.skips.most_common()]
     lines += [f"warning: {text}" for text in result.warnings]
     if result.interrupted:
@@ -143,7 +142,6 @@ _MEANINGS = {
     "CFMP % on the skin": "on the skin: against the body as posed, with its overlaps",
 }
 _FIGURES = (("vfcp_percent", 3), ("cfmp_percent", 1), ("max_depth_mm", 1), ("mpve_mm", 2))
-
 _FOLDS = ("folds_1", "folds_4", "folds_16", "folds_64")
 
 
@@ -159,21 +157,14 @@ def replay_columns(garments: Mapping[str, Mapping[str, Any]]) -> tuple[list[str]
     return [_HEADER[i] for i in shown], [[row[i] for i in shown] for row in rows]
 
 
-def _rows(garments: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
+def _rows(garments: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     rows = []
     for name, after in garments.items():
-        latency = [f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99")]
-        on_skin = after["skin_cfmp_percent"]
-        folds = [after[key] for key in _FOLDS]
-        against_truth = "-" if None in folds else " ".join(f"{one:.2f}" for one in folds)
-        figures = (*_changes(after["before"], after), against_truth, "-" if on_skin is None else f"{on_skin:.1f}")
-        rows.append((name, str(after["n_frames"]), *latency, *figures))
+        row = [name, str(after["n_frames"]), *(f"{after['latency_ms'][p]:.2f}" for p in ("p50", "p95", "p99"))]
+        for key, digits in _FIGURES:
+            a, b = after["before"][key], after[key]
+            row.append("-" if a is None or b is None else f"{a:.{digits}f} → {b:.{digits}f}")
+        folds, on_skin = [after[key] for key in _FOLDS], after["skin_cfmp_percent"]
+        row.append("-" if None in folds else " ".join(f"{one:.2f}" for one in folds))
+        rows.append([*row, "-" if on_skin is None else f"{on_skin:.1f}"])
     return rows
-
-
-def _changes(before: Mapping[str, float | None], after: Mapping[str, float | None]) -> list[str]:
-    cells = []
-    for key, digits in _FIGURES:
-        a, b = before[key], after[key]
-        cells.append("-" if a is None or b is None else f"{a:.{digits}f} → {b:.{digits}f}")
-    return cells

@@ -97,22 +97,22 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
 def _check(options: TrainOptions) -> None:
     checked_device(options.device)
     is_plain = (options.network, options.backbone, options.preset) == ("garment", "tailornet", "realtime")
-    if options.like is not None and not is_plain:
-        msg = "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out"
-        raise RefuError(msg)
-    if options.like is not None and options.start is not None:
-        msg = "--like trains networks of its own: leave --start out"
-        raise RefuError(msg)
-    if options.start is not None:
-        given = options.scale, options.margin, options.unblended, options.network, options.preset
-        if given != ("vertex", None, False, "garment", "realtime"):
-            msg = "--start goes on with networks as they are: leave --scale, --margin, --unblended, --network and "
-            msg += "--preset out"
-            raise RefuError(msg)
+    changed = options.scale, options.margin, options.unblended, options.network, options.preset
+    is_changed = changed != ("vertex", None, False, "garment", "realtime")
     presets = SDF_PRESETS if options.network == "sdf" else PRESETS
-    if options.preset not in presets:
-        msg = f"no preset {options.preset!r} of training: wanted {', '.join(presets)}"
-        raise RefuError(msg)
+    refused = {
+        "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out": (
+            options.like is not None and not is_plain
+        ),
+        "--like trains networks of its own: leave --start out": options.like is not None and options.start is not None,
+        "--start goes on with networks as they are: leave --scale, --margin, --unblended, --network and --preset out": (
+            options.start is not None and is_changed
+        ),
+        f"no preset {options.preset!r} of training: wanted {', '.join(presets)}": options.preset not in presets,
+    }
+    for msg, is_so in refused.items():
+        if is_so:
+            raise RefuError(msg)
     check(options)
 
 

@@ -40,8 +40,7 @@ class GroundTruth:
     ) -> GroundTruth:
         """The ground truth in the bag at `path` of the garments whose faces (F, 3) are given.
 
-        Raises:
-            AdapterError: the bag can't be read, or a garment in it has another topology.
+        Raises `AdapterError`: the bag can't be read, or a garment in it has another topology.
         """
         garments: dict[str, dict[int, NDArray[np.float64]]] = {name: {} for name in faces}
         with adapters.BagReader(path) as reader:
@@ -93,8 +92,7 @@ class TrueFrame(NamedTuple):
 def moments_of(bag: Path, garment: GarmentTemplate) -> list[TrueFrame]:
     """The frames of a bag that come with the garment's truth.
 
-    Raises:
-        RefuError: the bag can't be read, or there is none of this garment.
+    Raises `RefuError`: the bag can't be read, or there is none of this garment.
     """
     truth = GroundTruth.of_bag(bag, {garment.name: garment.faces.cpu().numpy()})
     found, history = [], PoseHistory()

@@ -12,7 +12,7 @@ import base64
 import html
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core import RefuError
-from refu_lab.render import sky_light
+from refu_lab.render import COLLIDING, RenderMesh, sky_light
 
 STYLE = """
 #turntable canvas { width: 100%; height: min(78vh, 620px, 125vw); touch-action: pan-y; cursor: grab;
@@ -43,59 +43,39 @@ _SCRIPT = Path(__file__).with_suffix(".js")
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
-    """What a mesh has in common in all frames."""
-
-    name: str
-    faces: NDArray[np.int64]
-    """Counter-clockwise from outside, shape (F, 3)."""
-    color: tuple[float, float, float]
-    """sRGB, 0 to 1."""
-
-
-@dataclass(frozen=True, eq=False)
-class MeshInFrame:
-    """A mesh's vertices in one frame."""
-
-    vertices: NDArray[np.float32]
-    """y up [m], shape (V, 3)."""
-    colliding: NDArray[np.bool_] | None = None
-    """Vertices that are drawn red, shape (V,)."""
-
-
-@dataclass(frozen=True, eq=False)
 class Frame:
     """A frame and its captions."""
 
     name: str
     title: str
-    before: Sequence[MeshInFrame]
-    """Each mesh before collision handling; the first is the body."""
-    after: Sequence[MeshInFrame]
+    before: Sequence[RenderMesh]
+    """Each mesh before collision handling, y up; the first is the body. What is `COLLIDING` is drawn red."""
+    after: Sequence[RenderMesh]
     before_caption: str
     after_caption: str
     yaw: float
     """The camera's first yaw, from z towards x [degrees]."""
 
 
-def turntable(meshes: Sequence[Mesh], frames: Sequence[Frame]) -> str:
+def turntable(colours: Mapping[str, tuple[float, float, float]], frames: Sequence[Frame]) -> str:
     """HTML of the element, its data and its script; the page itself has to include `STYLE`.
 
-    Raises `RefuError` for a mesh with more vertices than a page can show.
+    `colours` are the meshes' names and sRGB colours, in their order. Raises `RefuError` for a mesh with more vertices
+    than a page can show.
     """
-    counts = [(len(frames[0].after[k].vertices), len(mesh.faces)) for k, mesh in enumerate(meshes)]
-    for mesh, (n_vertices, _) in zip(meshes, counts, strict=True):
+    counts = [np.shape(mesh.vertices)[:1] + np.shape(mesh.faces)[:1] for mesh in frames[0].after]
+    for name, (n_vertices, _) in zip(colours, counts, strict=True):
         if n_vertices > _MOST:
-            msg = f"{mesh.name}: {n_vertices} vertices, a page shows at most {_MOST}"
+            msg = f"{name}: {n_vertices} vertices, a page shows at most {_MOST}"
             raise RefuError(msg)
-    blocks = [_signed(np.diff(mesh.faces.reshape(-1), prepend=0)) for mesh in meshes]
+    blocks = [_signed(np.diff(np.asarray(mesh.faces).reshape(-1), prepend=0)) for mesh in frames[0].after]
     told: list[dict[str, Any]] = []
     for frame in frames:
-        every = np.concatenate([pose.vertices for pose in (*frame.before, *frame.after)])
+        every = np.concatenate([np.asarray(mesh.vertices) for mesh in (*frame.before, *frame.after)])
         low, extent = every.min(0), float(np.ptp(every, axis=0).max())
         step = max(extent, 1e-6) / _GRID
         centre = (low + every.max(0)) / 2
-        sides = [_quantised(meshes, poses, low, step) for poses in (frame.before, frame.after)]
+        sides = [_quantised(meshes, low, step) for meshes in (frame.before, frame.after)]
         for before, after in zip(*sides, strict=True):
             blocks += [_signed(np.diff(before.places, axis=1, prepend=0)), _signed(after.places - before.places)]
             blocks += [before.light.tobytes(), (after.light - before.light).tobytes()]  # modulo 256, as in the script
@@ -114,7 +94,7 @@ def turntable(meshes: Sequence[Mesh], frames: Sequence[Frame]) -> str:
             }
         )
     data = zlib.compress(b"".join(blocks), 9)
-    scene = {"frames": told, "colours": [mesh.color for mesh in meshes], "counts": counts}
+    scene = {"frames": told, "colours": [*colours.values()], "counts": counts}
     text = json.dumps(scene).replace("<", "\\u003c")  # so that no name can close the script element
     return f"""<div id="turntable"><canvas tabindex="0" role="img"
 aria-label="{html.escape(frames[0].title)}, to be turned with the mouse"></canvas><div></div><p class="note"></p></div>
@@ -132,14 +112,11 @@ class _Quantised(NamedTuple):
     """Shape (V,)."""
 
 
-def _quantised(
-    meshes: Sequence[Mesh], poses: Sequence[MeshInFrame], low: NDArray[np.float32], step: float
-) -> list[_Quantised]:
-    light = sky_light([(pose.vertices, mesh.faces) for mesh, pose in zip(meshes, poses, strict=True)])
+def _quantised(meshes: Sequence[RenderMesh], low: NDArray[np.float32], step: float) -> list[_Quantised]:
     found = []
-    for pose, sky in zip(poses, light, strict=True):
-        red = np.zeros(len(pose.vertices), bool) if pose.colliding is None else pose.colliding
-        places = np.rint((pose.vertices.T - low[:, None]) / step).astype(np.int64)
+    for mesh, sky in zip(meshes, sky_light(meshes), strict=True):
+        places = np.rint((np.asarray(mesh.vertices).T - low[:, None]) / step).astype(np.int64)
+        red = np.broadcast_to((np.asarray(mesh.colour) == COLLIDING).all(-1), sky.shape)
         found.append(_Quantised(places, np.rint(255 * np.clip(sky, 0, 1)).astype(np.uint8), red))
     return found
 

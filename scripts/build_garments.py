@@ -288,7 +288,7 @@ def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -
 
 def drape(v: Vertices, f: Faces, garment: Garment, body: SmplBody) -> Vertices:
     """A taut surface round the body at the garment's ease: it spans hollows and follows what protrudes."""
-    distance = BodyDistance(body)
+    shortfall = shortfall_from(body)
     smooth = smoothing_matrix(f, len(v))
     edges_on = _edges_on_cuts(v, f, garment.cuts)
     ease = garment.ease(v)
@@ -297,13 +297,9 @@ def drape(v: Vertices, f: Faces, garment: Garment, body: SmplBody) -> Vertices:
         axis = np.array([0.0, 0.0, 0.02])
         radial = (v - axis) * [1, 0, 1]
         v += garment.flare(v)[:, None] * radial / np.linalg.norm(radial, axis=1, keepdims=True)
-    for _ in range(60):
+    for turn in range(63):
         v += 0.5 * (smooth @ v - v)
-        v = distance.push(v, ease)
-        for loop, cut in edges_on:
-            v[loop] = cut.project(v[loop])
-    for _ in range(3):  # the push leaves small dents
-        v += 0.5 * (smooth @ v - v)
+        v = v + shortfall(v, ease) if turn < 60 else v  # the push leaves small dents
         for loop, cut in edges_on:
             v[loop] = cut.project(v[loop])
     return v
@@ -316,13 +312,13 @@ def keep_clear(v: Vertices, f: Faces, shapedirs: NDArray[np.float64], garment: G
     edges_on = _edges_on_cuts(v, f, garment.cuts)
     shapes = [(np.zeros(N_BETAS), CLEARANCE)]
     shapes += [(sign * 2 * np.eye(N_BETAS)[k], 0.001) for k in range(N_BETAS) for sign in (1, -1)]
-    bodies = [(betas, clearance, BodyDistance(body, betas)) for betas, clearance in shapes]
+    bodies = [(betas, clearance, shortfall_from(body, betas)) for betas, clearance in shapes]
     for _ in range(60):
         lift = np.zeros_like(v)
-        for betas, clearance, distance in bodies:
+        for betas, clearance, shortfall in bodies:
             shaped = v + shapedirs @ betas
-            lift = _larger(lift, distance.shortfall(shaped, clearance))
-            middles = distance.shortfall(shaped[edges].mean(1), clearance)
+            lift = _larger(lift, shortfall(shaped, clearance))
+            middles = shortfall(shaped[edges].mean(1), clearance)
             for end in (0, 1):
                 most = np.zeros_like(v)
                 order = np.argsort(np.linalg.norm(middles, axis=1))
@@ -337,27 +333,23 @@ def keep_clear(v: Vertices, f: Faces, shapedirs: NDArray[np.float64], garment: G
     return v
 
 
-class BodyDistance:
-    """Signed distance to one shape of a body in the T-pose."""
+def shortfall_from(
+    body: SmplBody, betas: NDArray[np.float64] | None = None
+) -> Callable[[Vertices, float | NDArray[np.float64]], Vertices]:
+    """For one shape of a body in the T-pose: the displacement, shape (P, 3), that brings points to a clearance.
 
-    def __init__(self, body: SmplBody, betas: NDArray[np.float64] | None = None) -> None:
-        shape = torch.zeros(1, N_BETAS) if betas is None else torch.as_tensor(betas, dtype=torch.float32)[None]
-        self._sdf = ExactSdf(body.faces)
-        self._sdf.update(body.rest_vertices(shape)[0])
+    It is zero where they have it.
+    """
+    shape = torch.zeros(1, N_BETAS) if betas is None else torch.as_tensor(betas, dtype=torch.float32)[None]
+    sdf = ExactSdf(body.faces)
+    sdf.update(body.rest_vertices(shape)[0])
 
-    def __call__(self, points: Vertices) -> tuple[NDArray[np.float64], Vertices]:
-        """Signed distance [m], shape (P,), and its unit gradient, (P, 3)."""
-        sample = self._sdf.query(torch.as_tensor(points, dtype=torch.float32))
-        return sample.distance.double().numpy(), sample.gradient.double().numpy()
+    def shortfall(points: Vertices, clearance: float | NDArray[np.float64]) -> Vertices:
+        sample = sdf.query(torch.as_tensor(points, dtype=torch.float32))
+        lack = np.maximum(clearance - sample.distance.double().numpy(), 0)
+        return lack[:, None] * sample.gradient.double().numpy()
 
-    def shortfall(self, points: Vertices, clearance: float | NDArray[np.float64]) -> Vertices:
-        """The displacement that brings points to a clearance, zero where they have it; shape (P, 3)."""
-        distance, gradient = self(points)
-        return np.maximum(clearance - distance, 0)[:, None] * gradient
-
-    def push(self, points: Vertices, clearance: float | NDArray[np.float64]) -> Vertices:
-        """The points, moved to at least the clearance."""
-        return points + self.shortfall(points, clearance)
+    return shortfall
 
 
 def _larger(a: Vertices, b: Vertices) -> Vertices:

@@ -15,14 +15,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import msg_adapters as adapters
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet.replay import pipeline_for
 from refu_lab.replay import replay
 from refu_lab.reproduction import METRICS
 from refu_lab.tables import write_json
-from refu_lab.truth import TOPIC
+from refu_lab.truth import garments_of
 
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "results" / "quick.json"
@@ -41,7 +40,11 @@ def figures_of(bag: Path) -> Figures:
     """What a replay measures in a bag, before and after collisions are removed."""
     found: Figures = {}
     for backbone, sdf in MODES:
-        how: dict[str, Any] = {"garments": true_garments(bag) or DEFAULT_GARMENTS, "backbone": backbone, "sdf": sdf}
+        how: dict[str, Any] = {
+            "garments": tuple(garments_of(bag)) or DEFAULT_GARMENTS,
+            "backbone": backbone,
+            "sdf": sdf,
+        }
         options = ReplayOptions(input=bag, max_frames=FRAMES, **how)
         result = replay(options, pipeline=pipeline_for(options))
         for garment in options.garments:
@@ -51,15 +54,6 @@ def figures_of(bag: Path) -> Figures:
                 if value is not None:
                     found[bag.stem, garment, method, metric] = value
     return found
-
-
-def true_garments(bag: Path) -> tuple[str, ...]:
-    """The garments that a bag has ground truth of."""
-    with adapters.BagReader(bag) as reader:
-        if TOPIC not in {topic.name for topic in reader.topics}:
-            return ()
-        names = {m.ns: None for message in reader.messages([TOPIC]) for m in adapters.decode_marker_array(message.data)}
-    return tuple(names)
 
 
 def fallen(found: Mapping[Any, float], known: Mapping[Any, float]) -> list[str]:

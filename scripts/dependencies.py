@@ -56,8 +56,6 @@ EXCEPTIONS = {
     "setuptools": "MIT",
 }
 """Looked up by hand, where metadata says nothing or names a part that isn't used."""
-EXCEPTED_FAMILIES = {"nvidia-": _CUDA}
-"""The same, by the beginning of names."""
 ACCEPTED: dict[str, str] = {}
 """Advisories that don't concern the project, each with the reason."""
 
@@ -116,8 +114,7 @@ def licence_of(package: Distribution) -> str:
 
 def exception(name: str) -> str | None:
     """What was looked up by hand; None where metadata will do."""
-    families = (licence for start, licence in EXCEPTED_FAMILIES.items() if name.startswith(start))
-    return EXCEPTIONS.get(name) or next(families, None)
+    return _CUDA if name.startswith("nvidia-") else EXCEPTIONS.get(name)
 
 
 def is_allowed(name: str, licence: str) -> bool:

@@ -91,33 +91,48 @@ class Recording:
         """Nothing to check: recordings don't end by themselves."""
 
 
-class Simulation:
-    """`refu simulate`: a small set of shorts."""
+class Continued:
+    """Work that goes on where it was killed: finished, its `files` have the bytes of uninterrupted work."""
 
-    count = 3
+    files: tuple[str, ...]
 
     def __init__(self, folder: Path) -> None:
-        from refu_core.simulation import GarmentDataset
-
         self.begin(folder / "reference")
-        self._wanted = self._columns(folder / "reference")
-        self._by_slot = GarmentDataset(folder / "reference")
-        require(len(self._by_slot) == self.count, "not every slot has got a sample, so that rows can't be compared")
+        self._wanted = self._bytes(folder / "reference")
         started = time.monotonic()
-        shutil.rmtree(folder / "again", ignore_errors=True)
         self.begin(folder / "again")  # all kernels are compiled by now
         self.check_finished(folder / "again")
         self.longest_s = 1.2 * (time.monotonic() - started)
 
     def begin(self, folder: Path) -> None:
+        raise NotImplementedError
+
+    def _bytes(self, folder: Path) -> dict[str, bytes]:
+        found = [path for pattern in self.files for path in folder.glob(pattern) if path.name != "seconds.npy"]
+        return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+    def check_finished(self, folder: Path) -> None:
+        got = self._bytes(folder)
+        for name, wanted in self._wanted.items():
+            require(got.get(name) == wanted, f"{name} differs")
+
+
+class Simulation(Continued):
+    """`refu simulate`: a small set of shorts."""
+
+    count, files = 3, ("*.npy", "shard-*-of-1/*.npy")
+
+    def __init__(self, folder: Path) -> None:
+        from refu_core.simulation import GarmentDataset
+
+        super().__init__(folder)
+        self._by_slot = GarmentDataset(folder / "reference")
+        require(len(self._by_slot) == self.count, "not every slot has got a sample, so that rows can't be compared")
+
+    def begin(self, folder: Path) -> None:
         from refu_core.simulation import simulate_dataset
 
         simulate_dataset(GARMENT, self.count, folder)
-
-    @staticmethod
-    def _columns(folder: Path) -> dict[str, Any]:
-        files = [*folder.glob("*.npy"), *folder.glob("shard-*-of-1/*.npy")]
-        return {path.name: np.load(path) for path in files if path.name != "seconds.npy"}
 
     def check(self, folder: Path) -> str:
         """Each sample that is marked as finished is the one that it should be."""
@@ -138,15 +153,11 @@ class Simulation:
             require(np.array_equal(dataset.column(name), wanted), f"{name} of a finished sample is another")
         return f"{len(dataset)} samples"
 
-    def check_finished(self, folder: Path) -> None:
-        """All files have the bytes of the reference."""
-        for name, wanted in self._wanted.items():
-            got = self._columns(folder)[name]
-            require(np.array_equal(got, wanted, equal_nan=wanted.dtype.kind == "f"), f"{name} differs")
 
-
-class Training:
+class Training(Continued):
     """`refu train`: a small network on a small set."""
+
+    files = ("*.safetensors",)
 
     def __init__(self, folder: Path) -> None:
         from refu_core import load_body, load_garment
@@ -163,12 +174,7 @@ class Training:
         loop = LoopSettings(batch_size=8, learning_rate=1e-2, weight_decay=0.01, check_every=4)
         steps = {"style_shape_steps": 16, "low_steps": 16, "steps": 16}
         self._settings = PretrainSettings(loop, rank=4, validation_share=0.2, **steps)
-        self.begin(folder / "reference")
-        self._wanted = {path.name: path.read_bytes() for path in (folder / "reference").glob("*.safetensors")}
-        started = time.monotonic()
-        self.begin(folder / "again")
-        self.check_finished(folder / "again")
-        self.longest_s = 1.2 * (time.monotonic() - started)
+        super().__init__(folder)
 
     def begin(self, folder: Path) -> None:
         from refu_core.training import pretrain
@@ -192,11 +198,6 @@ class Training:
             return "no checkpoint"
         done = ", ".join(states[0]["done"]) or "nothing"
         return f"done: {done}"
-
-    def check_finished(self, folder: Path) -> None:
-        """The weights have the bytes of the reference."""
-        for name, wanted in self._wanted.items():
-            require((folder / name).read_bytes() == wanted, f"{name} differs")
 
 
 WORKS: dict[str, type[Any]] = {"recording": Recording, "simulation": Simulation, "training": Training}

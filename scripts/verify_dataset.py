@@ -17,6 +17,7 @@ import json
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import cache
 from multiprocessing import get_context
@@ -186,16 +187,9 @@ def verdicts(directory: Path, *, body: str | None = None, processes: int = 1, ev
     settings = card["settings"]
     judged_by = (card["garment"], body, float(settings["drape"]["gap"]), float(settings["selection"]["stretch"]))
     tasks = [(place, judged_by, float(card["quantum_m"])) for place in places(directory, card)[::every]]
-    bar = tqdm(total=len(tasks), unit="garment", disable=None)
-    if processes == 1:
-        for task in tasks:
-            yield _verdict(task)
-            bar.update()
-        return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        for verdict in pool.map(_verdict, tasks, chunksize=16):
-            yield verdict
-            bar.update()
+    with nullcontext() if processes == 1 else ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        found = map(_verdict, tasks) if pool is None else pool.map(_verdict, tasks, chunksize=16)
+        yield from tqdm(found, total=len(tasks), unit="garment", disable=None)
 
 
 def summary(found: list[Verdict]) -> dict[str, Any]:

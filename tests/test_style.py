@@ -157,7 +157,7 @@ FORBIDDEN = {
     "refu_core.metrics": {"rclpy", "msg_adapters"} | HEAVY,
     "refu_core.training": {"rclpy", "msg_adapters", "numba"},
     "refu_lab.benchmark": {"rclpy", "numba"},
-    "refu_lab.evaluate": {"rclpy", "numba"},
+    "refu_lab.reproduction": {"rclpy", "numba"},
     "refu_lab.view": {"rclpy", "refu_ros"} | HEAVY,
 }
 """What a package must not pull in; those that may import torch are the last."""

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
+import subprocess
+import sys
+import tempfile
+import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 from tqdm import tqdm
 
-from refu_core import GarmentPipeline
+from refu_core import GarmentPipeline, RefuError, WeightsError
+from refu_core.modes import DEFAULT_GARMENTS
+from refu_core.weights import load_weights, weights_folder
 from refu_lab.benchmark import _sections as sections
-from refu_lab.benchmark._inputs import moments, read_stretches
-from refu_lab.benchmark._measure import one_core
-from refu_lab.benchmark._rows import BenchmarkResult
-from refu_lab.benchmark._starts import start_row
+from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, one_core
+from refu_lab.benchmark._sdfs import moments, read_stretches
 from refu_lab.commands.benchmark import BenchmarkOptions
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.replay import replay
@@ -29,8 +35,7 @@ Key = tuple[str, str]
 def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> BenchmarkResult:
     """Measures everything, pinned to one core.
 
-    Raises:
-        RefuError: no motion, a bag or weights that can't be read, or a process that couldn't be started.
+    Raises `RefuError`: no motion, a bag or weights that can't be read, or a process that couldn't be started.
     """
     result = BenchmarkResult(options.command, options.quick)
     with one_core() as core, tqdm(desc="benchmark", unit="step", disable=None if progress else True) as bar:
@@ -74,8 +79,10 @@ def _measure(options: BenchmarkOptions, result: BenchmarkResult, progress: Calla
 
 def machine_facts(device: str) -> dict[str, Any]:
     """Processor, cores, device and versions as plain values, ready for JSON."""
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    named = (line.partition(":")[2].strip() for line in cpuinfo if line.startswith("model name"))
     facts: dict[str, Any] = {
-        "processor": _processor(),
+        "processor": next(named, platform.machine()),
         "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
@@ -84,12 +91,6 @@ def machine_facts(device: str) -> dict[str, Any]:
     if torch.device(device).type == "cuda":
         facts["gpu"] = torch.cuda.get_device_name(device)
     return facts
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    named = (line.partition(":")[2].strip() for line in cpuinfo if line.startswith("model name"))
-    return next(named, platform.machine())
 
 
 def accuracies(
@@ -106,3 +107,58 @@ def accuracies(
     options = ReplayOptions(input=bag, garments=(garment,), max_frames=frames)
     found = {key: replay(options, pipeline=pipeline).after[garment].as_dict() for key, pipeline in pipelines.items()}
     return {key: {name: float(one[name]) for name in FIGURES if one[name] is not None} for key, one in found.items()}
+
+
+def start_row(
+    options: BenchmarkOptions, *, mode: str, backbone: str, unit_ms: float, first_ever: bool = False
+) -> BenchmarkRow:
+    """Seconds and megabytes of a process that loads two garments and dresses one person.
+
+    `first_ever` makes it compile its kernels, as on a machine where nothing has run yet. `unit_ms` is the time of the
+    plain query. Unless both garments have weights, the skinned template is worn. Raises `RefuError`: the process
+    failed.
+    """
+    sizes = _weights_mb(options, backbone, mode)
+    backbone = backbone if len(sizes) == len(DEFAULT_GARMENTS) else "skinned"
+    asked = {
+        "garments": DEFAULT_GARMENTS,
+        "sdf": mode,
+        "backbone": backbone,
+        "body": options.body,
+        "collider": options.collider,
+        "weights": None if options.weights is None else str(options.weights),
+    }
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with tempfile.TemporaryDirectory() as empty:
+        if first_ever:
+            environment["WARP_CACHE_PATH"] = empty
+        command = [sys.executable, str(Path(__file__).with_name("start.py")), repr(time.time()), json.dumps(asked)]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if run.returncode:
+        last = (run.stderr.strip().splitlines() or ["no word about it"])[-1]
+        msg = f"a process that was to dress one person failed: {last}"
+        raise RefuError(msg)
+    found: dict[str, float] = json.loads(run.stdout.strip().splitlines()[-1])
+    ms = 1e3 * found.pop("first_mesh_cpu_s")
+    return BenchmarkRow(
+        stage="start",
+        mode=mode,
+        garment=",".join(DEFAULT_GARMENTS),
+        ms_median=ms,
+        ratio=ms / unit_ms,
+        wall_ms_median=1e3 * found.pop("first_mesh_s"),
+        method="first start ever" if first_ever else "again",
+        backbone=backbone,
+        figures={**found, **{f"weights_mb_{name}": size for name, size in sizes.items()}},
+    )
+
+
+def _weights_mb(options: BenchmarkOptions, backbone: str, mode: str) -> dict[str, float]:
+    """Size on disk of each garment's basis and networks [MB], by name, of the garments that have them."""
+    sizes = {}
+    for garment in DEFAULT_GARMENTS:
+        folder = weights_folder(garment, options.weights)
+        with suppress(WeightsError):
+            files = [*load_weights(folder / f"{backbone}-{mode}").files, *load_weights(folder / "basis").files]
+            sizes[garment] = sum(file.stat().st_size for file in files) / 1e6
+    return sizes

@@ -1,4 +1,4 @@
-"""Comparable times: contenders take turns in one process on one core, measured in processor time."""
+"""Comparable times: contenders take turns in one process on one core, measured in processor time; and their rows."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import gc
 import os
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter, process_time
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -40,17 +40,6 @@ class Timing:
     def median(self) -> float:
         """[ms]."""
         return float(np.median(self.ms))
-
-    @property
-    def quartiles(self) -> tuple[float, float]:
-        """Lower and upper quartile [ms]."""
-        low, high = np.percentile(self.ms, (25, 75))
-        return float(low), float(high)
-
-    @property
-    def wall_median(self) -> float:
-        """[ms]."""
-        return float(np.median(self.wall_ms))
 
 
 @contextlib.contextmanager
@@ -102,6 +91,7 @@ def measure(
         progress: Called after every window of a contender.
     """
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in contenders}
+    finish: Callable[[], object] = torch.cuda.synchronize if on_gpu else lambda: None
     names = list(contenders)
     gc.collect()
     gc.disable()  # a collection would charge one contender for the garbage of all
@@ -116,7 +106,11 @@ def measure(
                 if name not in slow:
                     run(window[0])
                 for given in window[1:2] if name in slow else window[1:]:
-                    times[name].append(_timed(run, given, on_gpu=on_gpu))
+                    finish()
+                    wall, cpu = perf_counter(), process_time()
+                    run(given)
+                    finish()
+                    times[name].append((1e3 * (process_time() - cpu), 1e3 * (perf_counter() - wall)))
                 progress()
     finally:
         gc.enable()
@@ -124,11 +118,64 @@ def measure(
     return {name: Timing(pairs[:, 0], pairs[:, 1], on_gpu=on_gpu) for name, pairs in found.items()}
 
 
-def _timed(run: Callable[[Input], object], given: Input, *, on_gpu: bool) -> tuple[float, float]:
-    if on_gpu:
-        torch.cuda.synchronize()
-    wall, cpu = perf_counter(), process_time()
-    run(given)
-    if on_gpu:
-        torch.cuda.synchronize()
-    return 1e3 * (process_time() - cpu), 1e3 * (perf_counter() - wall)
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkRow:
+    """How long one thing took."""
+
+    stage: str
+    """What was measured: `sdf`, `frame`, `frame.<stage>`, `persons`, `unchanged` or `start`."""
+    mode: str
+    """The pipeline's mode, or `plain`, `paper` or `other`."""
+    garment: str
+    ms_median: float
+    """Median processor time; on a GPU, wall time [ms]."""
+    ratio: float
+    """Ratio of this time to that of the plain query (`PLAIN_QUERY`), measured in turn with it."""
+    ms_q1: float | None = None
+    ms_q3: float | None = None
+    wall_ms_median: float | None = None
+    samples: int = 1
+    device: str = "cpu"
+    method: str | None = None
+    backbone: str | None = None
+    persons: int | None = None
+    vertices: int | None = None
+    figures: Mapping[str, float] = field(default_factory=dict)
+    """Further figures, by name with unit."""
+
+    @classmethod
+    def of(cls, timing: Timing, plain: Timing, **facts: Any) -> BenchmarkRow:
+        """A row from a timing, and from that of the plain query measured in turn with it."""
+        low, high = map(float, np.percentile(timing.ms, (25, 75)))
+        spread: dict[str, Any] = {"ms_q1": low, "ms_q3": high, "wall_ms_median": float(np.median(timing.wall_ms))}
+        ratio = timing.median / plain.median
+        return cls(ms_median=timing.median, ratio=ratio, samples=len(timing.ms), **spread, **facts)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON; what doesn't apply is left out."""
+        values = {key: value for key, value in vars(self).items() if value is not None and key != "figures"}
+        return {**values, **self.figures}
+
+
+@dataclass(eq=False)
+class BenchmarkResult:
+    """Everything that the tables, the plot and the JSON file need."""
+
+    command: str
+    quick: bool
+    machine: dict[str, Any] = field(default_factory=dict)
+    rows: list[BenchmarkRow] = field(default_factory=list)
+    missing: dict[str, str] = field(default_factory=dict)
+    """What wasn't measured, and what is needed to measure it."""
+
+    def of(self, stage: str, **facts: Any) -> list[BenchmarkRow]:
+        """The rows of a stage whose fields have the values in `facts`."""
+        return [
+            row
+            for row in self.rows
+            if row.stage == stage and all(getattr(row, key) == value for key, value in facts.items())
+        ]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The machine-readable result (`--json`)."""
+        return vars(self) | {"rows": [row.as_dict() for row in self.rows]}

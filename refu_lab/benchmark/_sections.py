@@ -14,11 +14,9 @@ import torch
 
 import msg_adapters as adapters
 from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_garment
-from refu_lab.benchmark._inputs import EncodedFrame, Window
-from refu_lab.benchmark._measure import Timing, measure, processor_clock
+from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, Timing, measure, processor_clock
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
-from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
-from refu_lab.benchmark._sdfs import PLAIN_QUERY, SdfFrame, plain_query, sdf_methods
+from refu_lab.benchmark._sdfs import PLAIN_QUERY, EncodedFrame, Window, plain_query, sdf_methods
 from refu_lab.commands.benchmark import BenchmarkOptions
 
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]
@@ -43,23 +41,19 @@ class Section:
     device: str = "cpu"
 
     def measure(
-        self, contenders: Mapping[str, Callable[[Any], object]], windows: Sequence[Sequence[Any]], **how: Any
+        self, contenders: Mapping[str, Callable[[Any], object]], windows: Sequence[Sequence[Any]] = (), **how: Any
     ) -> dict[str, Timing]:
-        """`refu_lab.benchmark.measure` with this run's rounds."""
-        with nullcontext() if self.device == "cuda" else processor_clock():
-            return measure(
-                contenders,
-                windows,
-                rounds=self.options.sizes.rounds,
-                on_gpu=self.device == "cuda",
-                progress=self.progress,
-                **how,
-            )
-
-    def plain(self) -> Callable[[EncodedFrame], object]:
-        """The plain query on this section's device."""
+        """Times contenders and the plain query in this run's rounds, and in its windows unless others are given."""
+        on_gpu = self.device == "cuda"
         _, body = self.options.on_body(self.garment)
-        return _of_sdf(plain_query(body, self.device))
+        plain = plain_query(body, self.device)
+
+        def ask(given: EncodedFrame | Sequence[EncodedFrame]) -> object:
+            return plain((given if isinstance(given, EncodedFrame) else given[0]).sdf)
+
+        how |= {"rounds": self.options.sizes.rounds, "on_gpu": on_gpu, "progress": self.progress}
+        with nullcontext() if on_gpu else processor_clock():
+            return measure({PLAIN_QUERY: ask, **contenders}, windows or self.windows, **how)
 
     def add(self, stage: str, mode: str, timing: Timing, plain: Timing, **facts: Any) -> None:
         """Adds a row."""
@@ -72,6 +66,11 @@ class Section:
         for stage in stages[0]:
             ms = np.array([one[stage] for one in stages])
             self.add(f"frame.{stage}", mode, Timing(ms, ms), plain, **facts)
+
+    def load_pipeline(self, mode: str, backbone: str, *, graph: bool = True) -> GarmentPipeline:
+        """Another pipeline of this garment."""
+        how: dict[str, Any] = {"mode": mode, "backbone": backbone, "device": self.device, "graph": graph}
+        return self.options.load_pipeline(self.garment, **how)
 
 
 class FrameRunner:
@@ -115,10 +114,6 @@ class FrameRunner:
         return data
 
 
-def _of_sdf(ask: Callable[[SdfFrame], object]) -> Callable[[EncodedFrame], object]:
-    return lambda moment: ask(moment.sdf)
-
-
 def _of_frame(pipeline: Callable[[SmplFrame], object]) -> Callable[[EncodedFrame], object]:
     return lambda moment: pipeline(moment.frame)
 
@@ -137,11 +132,11 @@ def measure_sdfs(section: Section, *, network: bool) -> None:
     methods, missing = sdf_methods(body, garment, network=network, device=section.device)
     section.result.missing.update(missing)
     slow = {method.name for method in methods if method.is_slow}
-    times = section.measure({method.name: _of_sdf(method.ask) for method in methods}, section.windows, slow=slow)
+    windows = [[moment.sdf for moment in window] for window in section.windows]
+    times = section.measure({method.name: method.ask for method in methods}, windows, slow=slow)
     for method in sorted(methods, key=lambda method: method.mode not in MAIN_MODES):
-        section.add(
-            "sdf", method.mode, times[method.name], times[PLAIN_QUERY], method=method.name, vertices=garment.n_vertices
-        )
+        facts = {"method": method.name, "vertices": garment.n_vertices}
+        section.add("sdf", method.mode, times[method.name], times[PLAIN_QUERY], **facts)
 
 
 def measure_frames(
@@ -149,16 +144,14 @@ def measure_frames(
 ) -> None:
     """Whole frames of every pipeline, and the stages of the main ones. `figures` are added to the rows."""
     runners = frame_runners(section, pipelines)
-    names = {key: ", ".join(filter(None, key)) for key in runners}
-    contenders: dict[str, Callable[[EncodedFrame], object]] = {PLAIN_QUERY: section.plain()}
-    times = section.measure(contenders | {names[key]: runner for key, runner in runners.items()}, section.windows)
+    times = section.measure({", ".join(filter(None, key)): runner for key, runner in runners.items()})
     plain = times[PLAIN_QUERY]
     n = load_garment(section.garment).n_vertices
-    for key, name in names.items():
-        backbone, mode, method = key
+    for backbone, mode, method in runners:
+        timing = times[", ".join(filter(None, (backbone, mode, method)))]
         errors = {} if method == LAUNCHES else figures.get((backbone, mode), {})
         facts = {"backbone": backbone, "vertices": n, "persons": 1, "method": method, "figures": errors}
-        section.add("frame", mode, times[name], plain, **facts)
+        section.add("frame", mode, timing, plain, **facts)
     for (backbone, mode, method), runner in runners.items():
         if backbone == _backbone(pipelines) and mode in MAIN_MODES:
             section.add_stages(runner.stages, mode, plain, backbone=backbone, vertices=n, method=method)
@@ -169,52 +162,42 @@ def frame_runners(section: Section, pipelines: Pipelines) -> dict[tuple[str, str
     on_gpu, backbone = section.device == "cuda", _backbone(pipelines)
     runners = {(*key, GRAPH if on_gpu else None): FrameRunner(pipeline) for key, pipeline in pipelines.items()}
     for mode in MAIN_MODES if on_gpu else ():
-        pipeline = section.options.load_pipeline(
-            section.garment, mode=mode, backbone=backbone, device=section.device, graph=False
-        )
-        runners[backbone, mode, LAUNCHES] = FrameRunner(pipeline)
+        runners[backbone, mode, LAUNCHES] = FrameRunner(section.load_pipeline(mode, backbone, graph=False))
     return runners
 
 
 def measure_persons(section: Section, pipelines: Pipelines) -> None:
     """Frames of several persons: one input message for each, one output message for all."""
-    counts, backbone = section.options.sizes.persons, _backbone(pipelines)
-    windows = section.windows
+    counts, backbone, windows = section.options.sizes.persons, _backbone(pipelines), section.windows
     crowd = [
         [tuple(windows[(i + person) % len(windows)][k] for person in range(max(counts))) for k in range(len(window))]
         for i, window in enumerate(windows)
     ]
-    plain = section.plain()
-    contenders: dict[str, Callable[[Any], object]] = {PLAIN_QUERY: lambda moments: plain(moments[0])}
-    for mode in MAIN_MODES:
-        contenders |= {f"{mode} {n}": FrameRunner(pipelines[backbone, mode], persons=n) for n in counts}
-    times = section.measure(contenders, crowd)
-    for mode in MAIN_MODES:
-        for n in counts:
-            timing = times[f"{mode} {n}"]
-            figures = {"ratio_to_one_person": timing.median / times[f"{mode} {counts[0]}"].median}
-            section.add("persons", mode, timing, times[PLAIN_QUERY], persons=n, backbone=backbone, figures=figures)
+    keys = list(product(MAIN_MODES, counts))
+    times = section.measure({f"{m} {n}": FrameRunner(pipelines[backbone, m], persons=n) for m, n in keys}, crowd)
+    for mode, n in keys:
+        timing = times[f"{mode} {n}"]
+        figures = {"ratio_to_one_person": timing.median / times[f"{mode} {counts[0]}"].median}
+        section.add("persons", mode, timing, times[PLAIN_QUERY], persons=n, backbone=backbone, figures=figures)
 
 
 def measure_still(section: Section, pipelines: Pipelines) -> None:
     """An unchanging pose beside a moving one: the whole frame, and the pipeline alone."""
-    contenders: dict[str, Callable[[EncodedFrame], object]] = {PLAIN_QUERY: section.plain()}
+    contenders: dict[str, Callable[[EncodedFrame], object]] = {}
     backbone, held = _backbone(pipelines), section.windows[0][1]
     for mode in MAIN_MODES:
-        moving = pipelines[backbone, mode]
         # It needs a pipeline of its own: in a shared one, frames of the moving pose would come between.
-        still = section.options.load_pipeline(section.garment, mode=mode, backbone=backbone, device=section.device)
-        contenders[f"{mode} moving"] = FrameRunner(moving)
-        contenders[f"{mode} still"] = _always(FrameRunner(still), held)
-        contenders[f"{mode} moving, pipeline"] = _of_frame(moving)
-        contenders[f"{mode} still, pipeline"] = _always(_of_frame(still), held)
-    times = section.measure(contenders, section.windows)
+        moving, still = pipelines[backbone, mode], section.load_pipeline(mode, backbone)
+        for what, of in (("frame", FrameRunner), ("pipeline", _of_frame)):
+            contenders |= {f"{mode} moving {what}": of(moving), f"{mode} still {what}": _always(of(still), held)}
+    times = section.measure(contenders)
     for mode in MAIN_MODES:
-        frame, pipeline = (
-            times[f"{mode} still{part}"].median / times[f"{mode} moving{part}"].median for part in ("", ", pipeline")
-        )
-        figures = {"share_of_frame": frame, "share_of_pipeline": pipeline}
-        section.add("unchanged", mode, times[f"{mode} still"], times[PLAIN_QUERY], backbone=backbone, figures=figures)
+        figures = {
+            f"share_of_{what}": times[f"{mode} still {what}"].median / times[f"{mode} moving {what}"].median
+            for what in ("frame", "pipeline")
+        }
+        timing = times[f"{mode} still frame"]
+        section.add("unchanged", mode, timing, times[PLAIN_QUERY], backbone=backbone, figures=figures)
 
 
 def measure_paper(section: Section, pipelines: Pipelines) -> None:
@@ -224,10 +207,7 @@ def measure_paper(section: Section, pipelines: Pipelines) -> None:
     for dtype in types:
         settings = PaperSettings(dtype=dtype) if full else PaperSettings(pivots=2, width=64, dtype=dtype)
         paper = PaperStructure(*section.options.on_body(section.garment, device=section.device), settings=settings)
-        contenders: dict[str, Callable[[EncodedFrame], object]] = {
-            PLAIN_QUERY: section.plain(),
-            "paper": _of_frame(paper),
-        }
+        contenders: dict[str, Callable[[EncodedFrame], object]] = {"paper": _of_frame(paper)}
         contenders |= {mode: FrameRunner(pipelines[_backbone(pipelines), mode]) for mode in MAIN_MODES}
         times = section.measure(contenders, section.windows[:2], slow={"paper"} if full else ())
         plain = times[PLAIN_QUERY]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from refu_lab.benchmark._rows import BenchmarkResult, BenchmarkRow
+from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow
 from refu_lab.plots import new_axes
 from refu_lab.reproduction import published_modes
 from refu_lab.tables import TextTable, picture_markdown, write_json, write_page
@@ -28,7 +28,7 @@ def frames(result: BenchmarkResult) -> TextTable:
             per_thousand = f"{1e3 * row.ms_median / row.vertices:.2f}" if row.vertices else "-"
             errors = (_figure(row, "mpve_mm", 2), _figure(row, "vfcp_percent", 3), _figure(row, "cfmp_percent", 1))
             name = ", ".join(filter(None, (row.garment, row.backbone, row.mode, row.method)))
-            rows.append((_where(row, name), *_times(row), per_thousand, *errors))
+            rows.append(_line(row, name, per_thousand, *errors))
     header = ("frame, bytes to bytes", *_TIMES, "ms / 1,000 vertices", "MPVE mm", "VFCP %", "CFMP %")
     note = (
         "Errors are those of the frames with ground truth in bags/eval_*: bodies and motion that were not trained on."
@@ -51,31 +51,23 @@ def stages(result: BenchmarkResult) -> TextTable:
 
 def sdfs(result: BenchmarkResult) -> TextTable:
     """Run time of every signed distance."""
-    rows = [(_where(row, f"{row.garment}: {row.method}"), *_times(row)) for row in result.of("sdf")]
+    rows = [_line(row, f"{row.garment}: {row.method}") for row in result.of("sdf")]
     note = "Of all vertices of a body's new pose, preparation included. The plain query is the unit of all ratios."
     return TextTable("Every signed distance, of the same vertices", ("signed distance", *_TIMES), rows, note)
 
 
 def persons(result: BenchmarkResult) -> TextTable:
     """How run time grows with the number of persons."""
-    rows = [
-        (_where(row, f"{row.mode}, {row.persons}"), *_times(row), _figure(row, "ratio_to_one_person", 2))
-        for row in result.of("persons")
-    ]
+    ratio = "ratio_to_one_person"
+    rows = [_line(row, f"{row.mode}, {row.persons}", _figure(row, ratio, 2)) for row in result.of("persons")]
     return TextTable("Persons", ("mode, persons", *_TIMES, "to one person"), rows)
 
 
 def unchanged(result: BenchmarkResult) -> TextTable:
     """Run time when the pose doesn't change."""
-    rows = [
-        (
-            _where(row, row.mode),
-            *_times(row),
-            f"{100 * row.figures['share_of_frame']:.1f}",
-            f"{100 * row.figures['share_of_pipeline']:.1f}",
-        )
-        for row in result.of("unchanged")
-    ]
+    keys = ("share_of_frame", "share_of_pipeline")
+    shares = [(row, [f"{100 * row.figures[key]:.1f}" for key in keys]) for row in result.of("unchanged")]
+    rows = [_line(row, row.mode, *of_row) for row, of_row in shares]
     header = ("mode", *_TIMES, "% of a frame", "% of the pipeline")
     note = "Bytes to bytes; the pipeline alone is without decoding and encoding."
     return TextTable("Unchanged pose", header, rows, note)
@@ -86,10 +78,10 @@ def paper(result: BenchmarkResult) -> TextTable:
     rows: list[tuple[str, ...]] = []
     for row in result.of("frame", mode="paper"):
         times = (_figure(row, "times_hybrid", 0), _figure(row, "times_accurate", 0))
-        rows.append((_where(row, f"here: {row.backbone}, whole frame"), *_times(row), *times))
+        rows.append(_line(row, f"here: {row.backbone}, whole frame", *times))
         own = (one for one in result.rows if one.stage.startswith("frame.") and one.mode == "paper")
         same = (one for one in own if (one.backbone, one.device) == (row.backbone, row.device))
-        rows += [(_where(one, f"- {one.stage.partition('.')[2]}"), *_times(one), "", "") for one in same]
+        rows += [_line(one, f"- {one.stage.partition('.')[2]}", "", "") for one in same]
     if rows:
         for mode, one in published_modes().items():
             rows.append((f"published, all garments: {mode}, on a V100", f"{one['ms']:.1f}", *[""] * 5))
@@ -123,10 +115,12 @@ _TIMES = ("ms", "quartiles", "wall ms", "ratio")
 _START_FIGURES = (("import_s", 2), ("load_s", 2), ("resident_mb", 0), ("peak_mb", 0))
 
 
-def _times(row: BenchmarkRow) -> tuple[str, str, str, str]:
+def _line(row: BenchmarkRow, name: str, *figures: str) -> tuple[str, ...]:
+    """A row's name, times (`_TIMES`) and figures."""
+    place = name if row.device == "cpu" else f"{name} [{row.device}]"
     spread = "" if row.ms_q1 is None else f"{_ms(row.ms_q1)} … {_ms(row.ms_q3 or 0.0)}"
     wall = "" if row.wall_ms_median is None else _ms(row.wall_ms_median)
-    return _ms(row.ms_median), spread, wall, f"{row.ratio:.2f}" if row.ratio < 100 else f"{row.ratio:,.0f}"
+    return place, _ms(row.ms_median), spread, wall, _ms(row.ratio), *figures
 
 
 def _ms(value: float) -> str:
@@ -138,18 +132,13 @@ def _figure(row: BenchmarkRow, name: str, digits: int) -> str:
     return "-" if value is None else f"{value:,.{digits}f}"
 
 
-def _where(row: BenchmarkRow, name: str) -> str:
-    return name if row.device == "cpu" else f"{name} [{row.device}]"
-
-
 PAGE, DATA = "performance.md", "performance.json"
 
 
 def write_results(result: BenchmarkResult, folder: Path) -> list[Path]:
     """Writes `performance.md`, `performance.json` and, if errors were measured, the plot; returns their paths.
 
-    Raises:
-        RefuError: the folder can't be written.
+    Raises `RefuError`: the folder can't be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     plot = plot_time_against_error(result, folder)

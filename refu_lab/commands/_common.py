@@ -10,6 +10,7 @@ import stat
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -78,27 +79,7 @@ def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
     return parse
 
 
-def positive(text: str) -> int:
-    """A whole number above zero."""
-    return _number(int, text, 1, _MOST)
-
-
-def seed(text: str) -> int:
-    """A whole number that can be a random seed."""
-    return _number(int, text, 0, _MOST)
-
-
-def port(text: str) -> int:
-    """A port number."""
-    return _number(int, text, 1, 65_535)
-
-
-def between(low: float, high: float) -> Callable[[str], float]:
-    """A parser of a number from `low` to `high`."""
-    return lambda text: _number(float, text, low, high)
-
-
-def _number(kind: type[Number], text: str, low: float, high: float) -> Number:
+def _number(kind: type[Number], text: str, *, low: float, high: float) -> Number:
     try:
         number = kind(text)
     except ValueError:
@@ -110,6 +91,19 @@ def _number(kind: type[Number], text: str, low: float, high: float) -> Number:
         msg = f"wanted a {'whole ' if kind is int else ''}number {bounds}, got {printable(repr(text))}"
         raise argparse.ArgumentTypeError(msg)
     return number
+
+
+positive = partial(_number, int, low=1, high=_MOST)
+"""A whole number above zero."""
+seed = partial(_number, int, low=0, high=_MOST)
+"""A whole number that can be a random seed."""
+port = partial(_number, int, low=1, high=65_535)
+"""A port number."""
+
+
+def between(low: float, high: float) -> Callable[[str], float]:
+    """A parser of a number from `low` to `high`."""
+    return partial(_number, float, low=low, high=high)
 
 
 def in_path(text: str) -> Path:
@@ -124,9 +118,27 @@ def in_path(text: str) -> Path:
     return Path(text)
 
 
-def out_file(text: str) -> Path:
-    """The path of a file to write; whatever exists there must be a file."""
-    return _output(text, "a file", stat.S_ISREG)
+def _output(wanted: str, *kinds: Callable[[int], bool]) -> Callable[[str], Path]:
+    """A parser of the path of something to write; whatever exists there must be of one of these kinds."""
+
+    def parse(text: str) -> Path:
+        found = in_path(text)
+        try:
+            is_right = any(is_kind(found.stat().st_mode) for is_kind in kinds)
+        except FileNotFoundError:
+            is_right = True
+        except OSError as error:
+            msg = f"{printable(text)} can't be written: {error.strerror}"
+            raise argparse.ArgumentTypeError(msg) from error
+        if not is_right or not found.name:
+            msg = f"wanted {wanted} to write, or a new one; {printable(text)} is something else"
+            raise argparse.ArgumentTypeError(msg)
+        return found
+
+    return parse
+
+
+out_file, out_folder = _output("a file", stat.S_ISREG), _output("a folder", stat.S_ISDIR)
 
 
 def out_picture(text: str) -> Path:
@@ -138,33 +150,13 @@ def out_picture(text: str) -> Path:
     return found
 
 
-def out_folder(text: str) -> Path:
-    """The path of a folder to write to; whatever exists there must be a folder."""
-    return _output(text, "a folder", stat.S_ISDIR)
-
-
 def out_bag(text: str) -> Path:
     """The path of a bag to write, a file or a folder; a new folder isn't named like a file of another kind."""
     path = in_path(text)
     if (path.suffix[1:].isalpha() or path.suffix == ".db3") and path.suffix != ".mcap" and not path.is_dir():
         msg = f"bags are written as NAME.mcap, or as a folder, whose name has no {path.suffix}; got {printable(text)}"
         raise argparse.ArgumentTypeError(msg)
-    return _output(text, "a file or a folder", lambda mode: stat.S_ISREG(mode) or stat.S_ISDIR(mode))
-
-
-def _output(text: str, wanted: str, is_wanted: Callable[[int], bool]) -> Path:
-    found = in_path(text)
-    try:
-        is_right = is_wanted(found.stat().st_mode)
-    except FileNotFoundError:
-        is_right = True
-    except OSError as error:
-        msg = f"{printable(text)} can't be written: {error.strerror}"
-        raise argparse.ArgumentTypeError(msg) from error
-    if not is_right or not found.name:
-        msg = f"wanted {wanted} to write, or a new one; {printable(text)} is something else"
-        raise argparse.ArgumentTypeError(msg)
-    return found
+    return _output("a file or a folder", stat.S_ISREG, stat.S_ISDIR)(text)
 
 
 def word(text: str) -> str:
@@ -237,32 +229,22 @@ def axes_of(what: str, frame: str) -> Any:
     )
 
 
-def rate_of_files() -> Any:
-    """A setting of commands that read motion files: their frame rate."""
-    return setting(
-        None, "frame rate of motion files, in place of their own", parse=between(0.001, 10_000), metavar="HZ"
-    )
-
-
-def worn_by() -> Any:
-    """A setting of commands that dress bodies: which body that is."""
-    return setting(
-        None,
-        "body to dress: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
-        "transferred to it (default: the body the garments were made for)",
-        parse=word,
-        metavar="FILE",
-    )
-
-
-def off_collider() -> Any:
-    """A setting of commands that dress bodies: what collisions are resolved against."""
-    return setting(True, "resolve collisions against the collider, or (--no-collider) against the raw posed body")
-
-
-def seeded() -> Any:
-    """A setting of commands that draw random numbers."""
-    return setting(0, "random seed", parse=seed, metavar="S")
+# Settings of commands that read motion files, dress bodies, or draw random numbers; each call makes a field.
+rate_of_files = partial(
+    setting, None, "frame rate of motion files, in place of their own", parse=between(0.001, 10_000), metavar="HZ"
+)
+worn_by = partial(
+    setting,
+    None,
+    "body to dress: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
+    "transferred to it (default: the body the garments were made for)",
+    parse=word,
+    metavar="FILE",
+)
+off_collider = partial(
+    setting, True, "resolve collisions against the collider, or (--no-collider) against the raw posed body"
+)
+seeded = partial(setting, 0, "random seed", parse=seed, metavar="S")
 
 
 def add_cluster(parser: argparse.ArgumentParser) -> None:

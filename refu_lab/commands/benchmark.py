@@ -122,16 +122,8 @@ class BenchmarkOptions:
         """A pipeline with one garment. Raises `WeightsError` if the backbone has no weights for it."""
         from refu_core import GarmentPipeline
 
-        return GarmentPipeline.load(
-            [garment],
-            body=self.body,
-            sdf=mode,
-            backbone=backbone,
-            weights=self.weights,
-            device=device,
-            graph=graph,
-            collider=self.collider,
-        )
+        how: dict[str, Any] = {"body": self.body, "weights": self.weights, "collider": self.collider}
+        return GarmentPipeline.load([garment], sdf=mode, backbone=backbone, device=device, graph=graph, **how)
 
     @property
     def command(self) -> str:

@@ -56,8 +56,8 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from refu_lab.evaluate import evaluate, results_dict, results_text
     from refu_lab.fleet import find_data_sets, open_engine
+    from refu_lab.reproduction import evaluate, results_dict, results_text
 
     options = EvaluateOptions(**cli.given(args, EvaluateOptions) | {"data": tuple(find_data_sets(args.data))})
     with open_engine(args.jobs, args.scheduler) as engine:

@@ -72,8 +72,6 @@ def run_list(args: argparse.Namespace) -> int:
     from refu_core.garments import garments_folder
     from refu_lab.garment import garments_table, list_garments
 
-    rows = list_garments()
-    print(garments_table(rows))
-    return cli.tell(
-        args, f"yours go to {garments_folder()} (REFU_GARMENTS)", {"folder": str(garments_folder()), "garments": rows}
-    )
+    rows, folder = list_garments(), garments_folder()
+    text = f"{garments_table(rows)}\nyours go to {folder} (REFU_GARMENTS)"
+    return cli.tell(args, text, {"folder": str(folder), "garments": rows})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -130,7 +131,7 @@ def _replay_one(args: argparse.Namespace) -> int:
     report = None if args.report is None else Path(args.report)
     output = None if args.output is None else Path(args.output)
     options = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
-    told = _print_progress if args.progress == "lines" else None
+    told = partial(print, "progress", flush=True) if args.progress == "lines" else None
     result = replay(options, progress=not args.quiet, told=told)
     cli.tell(args, replay_table(result), result.as_dict())
     if report is not None and result.frames:
@@ -138,10 +139,6 @@ def _replay_one(args: argparse.Namespace) -> int:
 
         print(f"report: {write_report(result, report, progress=not args.quiet)}")
     return cli.EXIT_INTERRUPTED if result.interrupted else 0
-
-
-def _print_progress(done: int, total: int) -> None:
-    print("progress", done, total, flush=True)
 
 
 def _replay_many(args: argparse.Namespace) -> int:

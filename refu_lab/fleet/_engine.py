@@ -43,8 +43,7 @@ class FleetError(RefuError):
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
     """The engine for `jobs` processes on this machine (None or 1: this one alone), or for a Dask scheduler's address.
 
-    Raises:
-        FleetError: Dask isn't installed, both were asked for, or there is no scheduler at the address.
+    Raises `FleetError`: Dask isn't installed, both were asked for, or there is no scheduler at the address.
     """
     if jobs is not None and scheduler is not None:
         msg = "wanted either processes of this machine (--jobs) or a cluster (--scheduler), got both"
@@ -192,8 +191,4 @@ def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) ->
 
 def run_function(function: Callable[[Task], Result]) -> Callable[[], Callable[[Task], Result]]:
     """The argument `make` of an engine, for a function that needs no preparation."""
-    return partial(_itself, function)
-
-
-def _itself(function: Callable[[Task], Result]) -> Callable[[Task], Result]:
-    return function
+    return partial(partial, function)  # gives the function when it is called

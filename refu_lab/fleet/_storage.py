@@ -7,7 +7,6 @@ or a run that resumes this one, finds all of it or nothing.
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 import tempfile
 import uuid
@@ -105,10 +104,6 @@ class Folder:
             file = folder / "text"
             file.write_text(text, encoding="utf-8")
             self.put(file, name)
-
-    def put_json(self, content: Any, name: str) -> None:
-        """Writes plain values as JSON."""
-        self.put_text(json.dumps(content, indent=1, allow_nan=False) + "\n", name)
 
     def read_json(self, name: str) -> Any:
         """Reads plain values; None if the file is missing or can't be read."""

@@ -54,11 +54,10 @@ class FleetResult:
 
     def garments(self) -> dict[str, dict[str, Any]]:
         """Figures of each garment over all frames of all recordings, in the form of a replay's JSON."""
-        names = {name: None for row in self.rows for name in row.get("garments", ())}
-        return {
-            name: _merged([row["garments"][name] for row in self.rows if name in row.get("garments", ())])
-            for name in names
-        }
+        parts: dict[str, list[Mapping[str, Any]]] = {}
+        for name, figures in (one for row in self.rows for one in row.get("garments", {}).items()):
+            parts.setdefault(name, []).append(figures)
+        return {name: _merged(of_name) for name, of_name in parts.items()}
 
     def as_dict(self) -> dict[str, Any]:
         """The machine-readable result (`--json`)."""
@@ -80,9 +79,7 @@ class FleetResult:
         header, rows = replay_columns(self.garments())
         garments = html_table(header, [[html.escape(cell) for cell in row] for row in rows])
         recordings = [[self._link(row), *(html.escape(cell) for cell in _cells(row)[1:])] for row in self.rows]
-        worst = [
-            [self._link(frame), *(html.escape(cell) for cell in _worst_cells(frame)[1:])] for frame in self.worst()
-        ]
+        worst = [[self._link(one), *(html.escape(cell) for cell in _worst_cells(one)[1:])] for one in self.worst()]
         frames = sum(row.get("frames", 0) for row in self.rows)
         left = f"; {self.n_left} not come to" if self.n_left else ""
         warned = "".join(f'<p class="warn">{html.escape(warning)}</p>' for warning in self.warnings())

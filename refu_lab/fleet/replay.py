@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,22 +58,13 @@ class FleetOptions:
         return self.output or self.report
 
 
-@dataclass(frozen=True)
-class _Job:
-    recording: Input
-    options: FleetOptions
-
-
 def replay_fleet(
     recordings: list[Input], options: FleetOptions, *, engine: Engine, progress: bool = False
 ) -> FleetResult:
     """Replays the recordings that aren't finished; the row of one that can't be replayed says why.
 
-    An interrupt (Ctrl-C) ends the run early: what is finished is kept and returned.
-
-    Raises:
-        RefuError: options that make no pipeline, a folder that can't be written or that another run writes to, or an
-            engine that can't be reached.
+    An interrupt (Ctrl-C) ends the run early: what is finished is kept and returned. Raises `RefuError`: options that
+    make no pipeline, a folder that can't be written or that another run writes to, or an engine that can't be reached.
     """
     pipeline_for(options.replay)  # options that fail for every recording are reported once, and now
     result = FleetResult(is_kept=(options.output or options.report) is not None)
@@ -81,10 +73,9 @@ def replay_fleet(
         for place in dict.fromkeys((options.output, options.report)):
             if place is not None:
                 stack.enter_context(Folder(place).locked())
-        jobs = [_Job(recording, options) for recording in recordings]
-        bar = stack.enter_context(tqdm(total=len(jobs), unit="recording", disable=None if progress else True))
+        bar = stack.enter_context(tqdm(total=len(recordings), unit="recording", disable=None if progress else True))
         try:
-            for index, row in engine.run(run_function(_replay_job), jobs):
+            for index, row in engine.run(run_function(partial(_replay_one, options)), recordings):
                 lost = {"error": row.reason} if isinstance(row, Lost) else row
                 rows[index] = {"name": recordings[index].name, "input": recordings[index].source, **lost}
                 bar.update()
@@ -97,39 +88,37 @@ def replay_fleet(
     return result
 
 
-def _replay_job(job: _Job) -> dict[str, Any]:
+def _replay_one(options: FleetOptions, recording: Input) -> dict[str, Any]:
     """A recording's record, existing or new; if it can't be replayed, the record is the error."""
     try:
-        with fetched(job.recording.source) as path:
-            return _finished_or_new(job, path)
+        with fetched(recording.source) as path:
+            return _finished_or_new(options, recording, path)
     except RefuError as error:
         return {"error": str(error)}
     except (OSError, UnicodeError, MemoryError, RecursionError) as error:
         return {"error": printable(str(error) or type(error).__name__)}
 
 
-def _finished_or_new(job: _Job, path: Path) -> dict[str, Any]:
-    options, name = job.options, job.recording.name
-    key = _key(job, path)
+def _finished_or_new(options: FleetOptions, recording: Input, path: Path) -> dict[str, Any]:
+    key, name = _key(options, recording, path), recording.name
     records = None if options.records is None else Folder(options.records)
     if records is not None and not options.again:
         known = records.read_json(f"{name}.json")
         if not isinstance(known, dict) or "key" not in known:
-            _require_free(job, records)
-        elif known["key"] == key and _is_there(known, job):
+            _require_free(options, name, records)
+        elif known["key"] == key and _is_there(known, options, name):
             return known | {"kept": True}
-    record = {"key": key, **_make(job, path)}
+    record = {"key": key, **_make(options, recording, path)}
     if records is not None:
-        records.put_json(record, f"{name}.json")
+        records.put_text(json.dumps(record, indent=1, allow_nan=False) + "\n", f"{name}.json")
     return record
 
 
-def _require_free(job: _Job, records: Folder) -> None:
+def _require_free(options: FleetOptions, name: str, records: Folder) -> None:
     """Raises `RefuError` where a recording without a record would write over anything but results of `refu replay`.
 
     A run that was killed leaves results without a record.
     """
-    options, name = job.options, job.recording.name
     taken = {records.at(f"{name}.json"): records.size(f"{name}.json") is not None}
     if options.output is not None:
         start = Folder(options.output).start(f"{name}.mcap")
@@ -142,28 +131,24 @@ def _require_free(job: _Job, records: Folder) -> None:
         raise RefuError(msg)
 
 
-def _is_there(record: dict[str, Any], job: _Job) -> bool:
-    options, name = job.options, job.recording.name
+def _is_there(record: dict[str, Any], options: FleetOptions, name: str) -> bool:
     if options.output is not None and Folder(options.output).size(f"{name}.mcap") != record.get("output_bytes", -1):
         return False
     return options.report is None or Folder(options.report).size(f"{name}/index.html") is not None
 
 
-def _make(job: _Job, path: Path) -> dict[str, Any]:
-    options, name = job.options, job.recording.name
-    pipeline = pipeline_for(options.replay)
-    size = output = None
-    with ExitStack() as stack:
-        bag = None
-        if options.output is not None:
-            # A bag contains its own name, so it is written under it.
-            bag = stack.enter_context(Folder(options.output).scratch()) / f"{Path(name).name}.mcap"
-        result = replay(replace(options.replay, input=path, output=bag), pipeline=pipeline)
+def _make(options: FleetOptions, recording: Input, path: Path) -> dict[str, Any]:
+    name = recording.name
+    told: dict[str, Any] = {"input": recording.source, "output": None, "output_bytes": None}
+    output = None if options.output is None else Folder(options.output)
+    with nullcontext() if output is None else output.scratch() as own:
+        bag = None if own is None else own / f"{Path(name).name}.mcap"  # a bag contains its own name
+        result = replay(replace(options.replay, input=path, output=bag), pipeline=pipeline_for(options.replay))
         if result.interrupted:  # a record is of a whole recording
             raise KeyboardInterrupt
-        if options.output is not None and bag is not None:
-            size, output = bag.stat().st_size, Folder(options.output).at(f"{name}.mcap")
-            Folder(options.output).put(bag, f"{name}.mcap")
+        if output is not None and bag is not None:
+            told |= {"output": output.at(f"{name}.mcap"), "output_bytes": bag.stat().st_size}
+            output.put(bag, f"{name}.mcap")
     if options.report is not None and result.frames:
         from refu_lab.report import write_report
 
@@ -171,7 +156,6 @@ def _make(job: _Job, path: Path) -> dict[str, Any]:
         with folder.scratch() as scratch:
             write_report(result, scratch / "page")
             folder.put(scratch / "page", name)
-    told = {"input": job.recording.source, "output": output, "output_bytes": size}
     return result.as_dict() | _over_all(result) | told
 
 
@@ -196,20 +180,12 @@ def _over_all(result: ReplayResult) -> dict[str, Any]:
     left = [frame.total("after") for frame in result.frames]
     n_free = sum(not (one.n_inside or one.n_pairs) for one in left)
     shares = [one.vfcp_percent for one in result.after.values() if one.vfcp_percent is not None]
-    start = result.frames[0].frame.stamp_ns
-    order = sorted(range(len(left)), key=lambda i: result.frames[i].badness, reverse=True)[:WORST]
-    worst = [
-        {
-            "frame": i,
-            "time_s": 1e-9 * (result.frames[i].frame.stamp_ns - start),
-            "stamp_ns": result.frames[i].frame.stamp_ns,
-            "n_inside": left[i].n_inside,
-            "n_pairs": left[i].n_pairs,
-            "max_depth_mm": 1e3 * left[i].max_depth,
-            "badness": [float(x) for x in result.frames[i].badness],
-        }
-        for i in order
-    ]
+    stamps = [one.frame.stamp_ns for one in result.frames]
+    worst = []
+    for i in sorted(range(len(left)), key=lambda i: result.frames[i].badness, reverse=True)[:WORST]:
+        when: dict[str, Any] = {"frame": i, "time_s": 1e-9 * (stamps[i] - stamps[0]), "stamp_ns": stamps[i]}
+        found = {"n_inside": left[i].n_inside, "n_pairs": left[i].n_pairs, "max_depth_mm": 1e3 * left[i].max_depth}
+        worst.append({**when, **found, "badness": [float(x) for x in result.frames[i].badness]})
     return {
         "free_percent": 100 * n_free / len(left),
         "vfcp_percent": sum(shares) / len(shares) if shares else None,
@@ -218,10 +194,10 @@ def _over_all(result: ReplayResult) -> dict[str, Any]:
     }
 
 
-def _key(job: _Job, path: Path) -> str:
+def _key(options: FleetOptions, recording: Input, path: Path) -> str:
     """Hash of the recording, of how it is replayed, and of the code and weights."""
-    read = (job.recording.name, _recording_hash(job.recording.source, path))
-    told = (__version__, code_hash(*_CODE), *read, _content(job.options.replay))
+    read = (recording.name, _recording_hash(recording.source, path))
+    told = (__version__, code_hash(*_CODE), *read, _content(options.replay))
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 

@@ -12,7 +12,7 @@ from refu_core.metrics import Figures
 from refu_core.simulation import POSTURES
 from refu_lab.reproduction._methods import SEQUENCE_SHAPES
 from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, Study
-from refu_lab.reproduction._tables import ALL, Missing, ResultRow, ResultTable, weighted
+from refu_lab.reproduction._tables import ALL, Missing, ResultTable, weighted
 
 ENERGY_ZOOM = 2.5e-3
 """Upper end of the paper's zoomed histogram [m²]."""
@@ -49,14 +49,12 @@ def sample_table(study: Study, name: str) -> ResultTable:
     """A table of `SAMPLE_TABLES`, garment by garment and, if there are several, over all of them."""
     spec = SAMPLE_TABLES[name]
     table = ResultTable(name, spec.title, spec.about)
-    for garment in study.n_samples:
-        for method in spec.methods:
-            values = spec.of(study.runs.get((garment, method)))
-            table.rows += [ResultRow.of(name, garment, method, metric, value) for metric, value in values.items()]
+    for garment, method in itertools.product(study.n_samples, spec.methods):
+        table.add(garment, method, spec.of(study.runs.get((garment, method))))
     if spec.is_summed:
-        table.rows += _over_all(study, table, spec.methods, spec.metrics)
+        _sum_up(study, table, spec.methods, spec.metrics)
     if name == "comparison":
-        table.rows += list(_trends(table))
+        _add_trends(table)
     table.missing = _missing_of(study, spec.methods)
     if name == "sequence":
         table.missing += _missing_sets(study)
@@ -82,7 +80,7 @@ def _missing_postures(study: Study) -> Iterator[Missing]:
     method = POSTURE_METHODS[-1]
     for garment in study.n_samples:
         run = study.runs.get((garment, method))
-        if run is not None and not any(run.postures):
+        if run is not None and not any(sample.posture for sample in run.samples):
             command = f"refu simulate {garment} --postures 1 --count N --output DIR"
             yield Missing(garment, method, "none of its test samples is in an everyday posture", command)
 
@@ -99,24 +97,24 @@ def posture_table(study: Study) -> ResultTable:
     table.missing = [*_missing_of(study, POSTURE_METHODS), *_missing_postures(study)]
     found = {garment: [study.runs.get((garment, name)) for name in POSTURE_METHODS] for garment in study.n_samples}
     if len(found) > 1:
-        found[ALL] = [MethodRun.joined(ALL, name, study.pooled(name)) for name in POSTURE_METHODS]
+        found[ALL] = [study.pooled(name) for name in POSTURE_METHODS]
     for garment, (before, after) in found.items():
         if before is None or after is None:
             continue
-        postures = [posture for posture in POSTURES if posture in after.postures]
+        known = {sample.posture for sample in after.samples}
+        postures = [posture for posture in POSTURES if posture in known]
         whole = Figures.over(after.of_postures(postures)).mpve_mm if postures else None
         groups = {**{posture: [posture] for posture in postures}, "all of them": postures}
         for title, group in groups.items() if whole else ():
-            samples = after.of_postures(group)
-            figures = Figures.over(samples)
+            figures = Figures.over(after.of_postures(group))
             values = {
-                "n_samples": float(len(samples)),
+                "n_samples": float(figures.n_frames),
                 "network_mpve_mm": Figures.over(before.of_postures(group)).mpve_mm,
                 "mpve_mm": figures.mpve_mm,
                 "share_of_mean": None if figures.mpve_mm is None or whole is None else figures.mpve_mm / whole,
                 "cfmp_percent": figures.cfmp_percent,
             }
-            table.rows += [ResultRow.of("postures", garment, title, metric, value) for metric, value in values.items()]
+            table.add(garment, title, values)
     return table
 
 
@@ -130,66 +128,60 @@ def time_table(study: Study) -> ResultTable:
         "distance and its optimisation. The optimisation includes its distances.",
         labels={name: label for name, (label, *_) in _COMPONENTS.items()},
     )
-    for garment in study.n_samples:
-        for name, (_, method, *parts) in _COMPONENTS.items():
-            run = study.runs.get((garment, method))
-            ms = None if run is None else run.median_ms(*parts)
-            table.rows.append(ResultRow.of("time", garment, name, "ms", ms))
-    table.rows += _over_all(study, table, tuple(_COMPONENTS), ("ms",))
+    for garment, (name, (_, method, *parts)) in itertools.product(study.n_samples, _COMPONENTS.items()):
+        run = study.runs.get((garment, method))
+        table.add(garment, name, {"ms": None if run is None else run.median_ms(*parts)})
+    _sum_up(study, table, tuple(_COMPONENTS), ("ms",))
     table.missing = _missing_of(study, TIMED_METHODS)
     return table
 
 
-def _over_all(study: Study, table: ResultTable, methods: Sequence[str], metrics: Sequence[str]) -> Iterator[ResultRow]:
-    """The means over several garments, weighted by their numbers of samples."""
-    if len(study.n_samples) > 1:
-        for method, metric in itertools.product(methods, metrics):
-            mean = weighted((table.value(g, method, metric), n) for g, n in study.n_samples.items())
-            yield ResultRow.of(table.name, ALL, method, metric, mean)
+def _sum_up(study: Study, table: ResultTable, methods: Sequence[str], metrics: Sequence[str]) -> None:
+    """Adds the means over several garments, weighted by their numbers of samples."""
+    for method in methods if len(study.n_samples) > 1 else ():
+        values = {m: weighted((table.value(g, method, m), n) for g, n in study.n_samples.items()) for m in metrics}
+        table.add(ALL, method, values)
 
 
-def _trends(table: ResultTable) -> Iterator[ResultRow]:
-    """The changes against the backbone alone [%], for all other methods but the skinned template."""
+def _add_trends(table: ResultTable) -> None:
+    """Adds the changes against the backbone alone [%], for all other methods but the skinned template."""
     for row in list(table.rows):
         base = table.value(row.garment, "tailornet", row.metric)
         if row.method not in ("skinned", "tailornet"):
             change = None if row.value is None or not base else 100.0 * (row.value - base) / base
-            yield ResultRow.of(table.name, row.garment, row.method, f"{row.metric}_trend", change)
+            table.add(row.garment, row.method, {f"{row.metric}_trend": change})
 
 
 def _alpha_values(run: MethodRun) -> Values:
     """The main figures and, for ReFU, its mean α by how wrong its distance is."""
     values = {metric: getattr(run.figures, metric) for metric in _MAIN}
-    groups = zip(itertools.pairwise(RATIO_EDGES), run.scales.count, run.scales.total, strict=True)
+    groups = zip(itertools.pairwise(RATIO_EDGES), *run.scales, strict=True)
     for (low, high), count, total in groups if run.method == "refu-approx" else ():
         if count:
             values[f"mean α at a ratio of {low:g} to {high:g}"] = float(total / count)
     return values
 
 
-_ENERGY: Mapping[str, Callable[[np.ndarray], float]] = {
-    "mean_energy": lambda e: float(e.mean()),
-    "median_energy": lambda e: float(np.median(e)),
-    "zero_energy_percent": lambda e: 100.0 * float((e == 0).mean()),
-    "low_energy_percent": lambda e: 100.0 * float((e < ENERGY_ZOOM).mean()),
-}
-
-
 def _energy_values(run: MethodRun) -> Values:
-    return {metric: of(run.values("energy")) for metric, of in _ENERGY.items()}
+    energy = run.values("energy")
+    return {
+        "mean_energy": float(energy.mean()),
+        "median_energy": float(np.median(energy)),
+        "zero_energy_percent": 100.0 * float((energy == 0).mean()),
+        "low_energy_percent": 100.0 * float((energy < ENERGY_ZOOM).mean()),
+    }
 
 
 def _unseen_values(run: MethodRun) -> Values:
-    groups = unseen_groups([run])
-    return {f"error [mm] at {d.min():.2f} to {d.max():.2f}": float(error.mean()) for d, error in groups}
+    return {f"error [mm] at {d.min():.2f} to {d.max():.2f}": float(error.mean()) for d, error in unseen_groups(run)}
 
 
-def unseen_groups(runs: Sequence[MethodRun]) -> list[tuple[np.ndarray, np.ndarray]]:
+def unseen_groups(run: MethodRun) -> list[tuple[np.ndarray, np.ndarray]]:
     """(distances, collision errors [mm]) of groups of equally many samples by distance; none if one is unknown."""
-    distance = np.array([d for run in runs for d in run.unseen])
+    distance = np.array([sample.unseen for sample in run.samples])
     if not len(distance) or not np.isfinite(distance).all():
         return []
-    error = np.concatenate([run.values("collision_error_mm") for run in runs])
+    error = run.values("collision_error_mm")
     groups = np.array_split(np.argsort(distance, kind="stable"), min(UNSEEN_GROUPS, len(distance)))
     return [(distance[rows], error[rows]) for rows in groups]
 
@@ -281,7 +273,7 @@ SAMPLE_TABLES: Mapping[str, SampleTable] = {
         "E = Σ max(0, -f)² over a garment's vertices, with the exact distance f. The paper takes its energy from "
         "another work without giving the formula; this one is ours, so only the shape of the histograms compares.",
         ("skinned", "tailornet", *(f"refu-{mode}" for mode in _MODES)),
-        metrics=tuple(_ENERGY),
+        metrics=("mean_energy", "median_energy", "zero_energy_percent", "low_energy_percent"),
         values=_energy_values,
         is_summed=False,
     ),
@@ -307,15 +299,13 @@ _COMPONENTS: Mapping[str, tuple[str, ...]] = {
     "optimisation, accurate": ("optimisation post-process, accurate", "optimisation-accurate", "post-process"),
     "optimisation, kept": (
         "optimisation post-process, approximate, ReFU's margin kept everywhere",
-        "optimisation-kept-on-hybrid",
-        "post-process",
+        *("optimisation-kept-on-hybrid", "post-process"),
     ),
     "skinned backbone": ("skinned template", "skinned", "backbone"),
     "skinned, naive": ("skinned, naive post-process, accurate", "skinned-naive", "post-process"),
     "skinned, optimisation": (
         "skinned, optimisation post-process, accurate",
-        "skinned-optimisation",
-        "post-process",
+        *("skinned-optimisation", "post-process"),
     ),
 }
 """For each component its label, the method that has it, and the parts of that method's time."""

@@ -1,12 +1,19 @@
-"""The methods compared: what each predicts with, how it handles collisions, and which command trains it."""
+"""The methods compared: what each predicts with, how it handles collisions, what trains it, and its weights."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, cast
 
-from refu_core.modes import DEFAULT_MARGIN
+from refu_core.body import load_fit
+from refu_core.errors import WeightsError
+from refu_core.garments import load_garment
+from refu_core.modes import DEFAULT_MARGIN, BackboneName
+from refu_core.realtime import GarmentPipeline, Wearable, wearable_of
+from refu_core.weights import load_weights, weights_folder
 
 Handling = Literal["none", "naive", "optimisation", "refu", "node"]
 SdfName = Literal["approx", "accurate"]
@@ -68,89 +75,117 @@ _RUN_TIME_SDF: Mapping[str, SdfName] = {"approx": "approx", "accurate": "accurat
 """Hybrid uses the accurate distance in the training loss, the approximate one in ReFU (paper, Sec. "Settings")."""
 
 
+def _methods() -> Iterator[Method]:
+    skinned = Method("skinned", "skinned template (no network)", backbone="skinned", base="skinned")
+    yield skinned
+    for name, mode, handling, label in (
+        ("skinned-naive", "none", "naive", "skinned, naive post-process"),
+        ("skinned-optimisation", "none", "optimisation", "skinned, optimisation post-process"),
+        ("node-skinned", "accurate", "node", "the node, skinned"),
+    ):
+        yield replace(
+            skinned,
+            name=name,
+            label=f"{label}, accurate",
+            mode=mode,
+            handling=cast("Handling", handling),
+            sdf="accurate",
+        )
+    yield Method("tailornet", "backbone alone (TailorNet)")
+    for sdf in _SDFS:
+        drape = Method(f"optimisation-{sdf}", f"optimisation post-process, {sdf}", handling="optimisation", sdf=sdf)
+        yield drape
+        yield _variant(drape, "-margin", ", with ReFU's margin", margin=DEFAULT_MARGIN)
+        yield Method(f"naive-{sdf}", f"naive post-process, {sdf}", handling="naive", sdf=sdf)
+        yield Method(f"collision-loss-{sdf}", f"collision loss, {sdf}", mode=f"collision-{sdf}")
+        if sdf == "approx":
+            for kept, label in (("", ""), ("-kept", " kept everywhere")):
+                label = f", with ReFU's margin{label}, on ReFU hybrid's backbone"
+                on_hybrid = replace(drape, mode="hybrid", margin=DEFAULT_MARGIN, is_kept=bool(kept))
+                yield replace(on_hybrid, name=f"optimisation{kept}-on-hybrid", label=drape.label + label)
+    gcnn = Method("gcnn", "GCNN", backbone="gcnn", base="gcnn")
+    yield gcnn
+    for mode, sdf in _RUN_TIME_SDF.items():
+        refu = Method(f"refu-{mode}", f"ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
+        yield from _ablated(refu, f"bare-{mode}", "bare")
+        yield replace(refu, name=f"node-{mode}", label=f"the node, {mode}", handling="node")
+        yield _variant(gcnn, f"-refu-{mode}", f" with ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
+    for sdf in _SDFS:
+        fixed = Method(f"fixed-{sdf}", f"fixed scale, {sdf}", mode=sdf, folder="fixed", handling="refu", sdf=sdf)
+        yield from _ablated(fixed, f"fixed-bare-{sdf}", "fixed-bare")
+    approx: dict[str, Any] = {"mode": "approx", "handling": "refu", "sdf": "approx"}
+    for n in (1, 2):
+        yield Method(f"alt{n}-approx", f"Alt. {n}, approx", folder=f"alt{n}", **approx)
+    for shapes in SEQUENCE_SHAPES:
+        name, label = f"mlp-{shapes}", f"{shapes} shapes"
+        mlp = Method(name, f"MLP, {label}", backbone="mlp", folder=f"sequence-{shapes}", base=name)
+        yield mlp
+        yield replace(mlp, name=f"{name}-refu-approx", label=f"MLP with ReFU, approx, {label}", **approx)
+
+
 def _variant(of: Method, suffix: str, label: str, **changes: Any) -> Method:
     """A changed method, with `suffix` appended to its name and `label` to its label."""
     return replace(of, name=of.name + suffix, label=of.label + label, **changes)
 
 
-def _skinned() -> Iterator[Method]:
-    alone = Method("skinned", "skinned template (no network)", backbone="skinned", base="skinned")
-    yield alone
-    for handling in ("naive", "optimisation"):
-        label = f"skinned, {handling} post-process, accurate"
-        yield replace(alone, name=f"skinned-{handling}", label=label, handling=handling, sdf="accurate")
-    label = "the node, skinned, accurate"
-    yield replace(alone, name="node-skinned", label=label, mode="accurate", handling="node", sdf="accurate")
-
-
-def _post_processes() -> Iterator[Method]:
-    for sdf in _SDFS:
-        drape = Method(f"optimisation-{sdf}", f"optimisation post-process, {sdf}", handling="optimisation", sdf=sdf)
-        yield Method(f"naive-{sdf}", f"naive post-process, {sdf}", handling="naive", sdf=sdf)
-        yield drape
-        yield _variant(drape, "-margin", ", with ReFU's margin", margin=DEFAULT_MARGIN)
-        yield Method(f"collision-loss-{sdf}", f"collision loss, {sdf}", mode=f"collision-{sdf}")
-    for name, label, is_kept in (("optimisation", "", False), ("optimisation-kept", " kept everywhere", True)):
-        yield Method(
-            f"{name}-on-hybrid",
-            f"optimisation post-process, approx, with ReFU's margin{label}, on ReFU hybrid's backbone",
-            mode="hybrid",
-            handling="optimisation",
-            sdf="approx",
-            margin=DEFAULT_MARGIN,
-            is_kept=is_kept,
-        )
-
-
-def _refu() -> Iterator[Method]:
-    """ReFU as trained; without blending and margin at run time; trained without them (the paper's layer); the node."""
-    for mode, sdf in _RUN_TIME_SDF.items():
-        refu = Method(f"refu-{mode}", f"ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
-        yield from _ablated(refu)
-        yield replace(refu, name=f"node-{mode}", label=f"the node, {mode}", handling="node")
-        yield _trained_bare(refu, f"bare-{mode}", folder="bare")
-    for sdf in _SDFS:
-        fixed = Method(f"fixed-{sdf}", f"fixed scale, {sdf}", mode=sdf, folder="fixed", handling="refu", sdf=sdf)
-        yield from _ablated(fixed)
-        yield _trained_bare(fixed, f"fixed-bare-{sdf}", folder="fixed-bare")
-    for n in (1, 2):
-        label = f"Alt. {n}, approx"
-        yield Method(f"alt{n}-approx", label, mode="approx", folder=f"alt{n}", handling="refu", sdf="approx")
-
-
-def _ablated(whole: Method) -> Iterator[Method]:
+def _ablated(whole: Method, bare: str, folder: str) -> Iterator[Method]:
+    """As trained; without blending and margin at run time; and (`bare`) trained without, in a folder of its own."""
     yield whole
     yield _variant(whole, "-unblended", ", not blended", is_blended=False)
-    yield _variant(whole, "-bare", ", not blended, ε = 0", is_blended=False, margin=0.0)
+    without = _variant(whole, "-bare", ", not blended, ε = 0", is_blended=False, margin=0.0)
+    yield without
+    yield replace(without, name=bare, label=f"{without.label}, trained so (the paper's)", folder=folder, margin=None)
 
 
-def _trained_bare(whole: Method, name: str, *, folder: str) -> Method:
-    """The same method with the weights in `folder`, whose ε is 0 already."""
-    label = f"{whole.label}, not blended, ε = 0, trained so (the paper's)"
-    return replace(whole, name=name, label=label, folder=folder, is_blended=False)
-
-
-def _other_backbones() -> Iterator[Method]:
-    gcnn = Method("gcnn", "GCNN", backbone="gcnn", base="gcnn")
-    yield gcnn
-    for mode, sdf in _RUN_TIME_SDF.items():
-        yield _variant(gcnn, f"-refu-{mode}", f" with ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
-    for shapes in SEQUENCE_SHAPES:
-        name, label = f"mlp-{shapes}", f"{shapes} shapes"
-        mlp = Method(name, f"MLP, {label}", backbone="mlp", folder=f"sequence-{shapes}", base=name)
-        yield mlp
-        with_refu = f"MLP with ReFU, approx, {label}"
-        yield replace(mlp, name=f"{name}-refu-approx", label=with_refu, mode="approx", handling="refu", sdf="approx")
-
-
-METHODS: Mapping[str, Method] = {
-    method.name: method
-    for method in (
-        *_skinned(),
-        Method("tailornet", "backbone alone (TailorNet)"),
-        *_post_processes(),
-        *_refu(),
-        *_other_backbones(),
-    )
-}
+METHODS: Mapping[str, Method] = {method.name: method for method in _methods()}
 """All methods by name."""
+
+
+class Library:
+    """Trained weights: those in given folders, `<folder>/<garment>/<weights>`, before those that ship."""
+
+    def __init__(self, folders: Sequence[Path] = (), *, collider: bool = True, body: str | None = None) -> None:
+        """Searches `folders` first, in their order; collisions are resolved against the collider or against the skin.
+
+        Networks are loaded for a `body`, given by name or file; None takes the one that each garment is made for.
+
+        Raises `BodyError` if there is no such body, or garments can't be transferred to it.
+        """
+        self._folders = tuple(folders)
+        self.collider = collider
+        self.fit = None if body is None else load_fit(body)
+        self._named = body
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled without the body, which another process loads itself."""
+        return partial(Library, collider=self.collider, body=self._named), (self._folders,)
+
+    def find(self, name: str, garment: str) -> Path:
+        """Path of the files of a garment's weights, without suffix. Raises `WeightsError` if there are none."""
+        for folder in (weights_folder(garment, root) for root in (*self._folders, None)):
+            if (folder / f"{name}.json").exists():
+                return folder / name
+        msg = "not trained"
+        raise WeightsError(msg)
+
+    def load(self, method: Method, garment: str) -> Wearable:
+        """A method's networks. Raises `WeightsError` if they are missing, damaged or for another body."""
+        assert method.weights is not None
+        stored = load_weights(self.find(method.weights, garment), expect={"garment": garment})
+        return wearable_of(stored, load_garment(garment), self.fit)
+
+    def pipeline(self, method: Method, *garments: str) -> GarmentPipeline:
+        """The node's pipeline if the method is the node in some mode, else its backbone without collision handling.
+
+        Raises `RefuError` if the garments, worn together, don't all have weights in one folder.
+        """
+        weights = None if method.weights is None else self.find(method.weights, garments[0]).parent.parent
+        is_node = method.handling == "node"
+        return GarmentPipeline.load(
+            garments,
+            body=None if self.fit is None else self.fit.body,
+            sdf=method.mode if is_node else "none",
+            backbone=BackboneName.AUTO if is_node and method.weights is not None else method.backbone,
+            weights=weights,
+            collider=self.collider,
+        )

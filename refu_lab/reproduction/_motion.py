@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -27,9 +27,8 @@ from refu_core.metrics import (
 )
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import GarmentPipeline, PipelineOutput
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import METHODS
-from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
+from refu_lab.reproduction._methods import METHODS, Library
+from refu_lab.reproduction._tables import Missing, ResultTable
 
 OUTFITS = (DEFAULT_GARMENTS, ("shirt-male",), ("skirt-female",))
 """Garments that are worn together."""
@@ -61,13 +60,7 @@ _ABOUT = (
 )
 
 
-def motion_table(
-    clips: Mapping[str, Motion],
-    *,
-    library: Library,
-    every: int,
-    progress: bool = False,
-) -> ResultTable:
+def motion_table(clips: Mapping[str, Motion], *, library: Library, every: int, progress: bool = False) -> ResultTable:
     """Collisions, jumps, stretch and crossings of each garment, and how far skin was moved, clip by clip.
 
     `clips` are recorded motions by name; one frame in `every` so many is dressed and judged.
@@ -77,12 +70,7 @@ def motion_table(
     indices = {name: range(0, len(clip) - _step(clip), every) for name, clip in clips.items()}
     n_pairs = sum(map(len, indices.values()))
     shapes = drawn_shapes(n_pairs)
-    bar = tqdm(
-        total=len(OUTFITS) * n_pairs,
-        desc="motion",
-        unit="frame",
-        disable=None if progress else True,
-    )
+    bar = tqdm(total=len(OUTFITS) * n_pairs, desc="motion", unit="frame", disable=None if progress else True)
     found: dict[str, dict[tuple[str, str], list[Judged]]] = {}
     shifts: dict[str, dict[str, SkinShifts]] = {}
     for garments in OUTFITS:
@@ -114,13 +102,12 @@ def motion_table(
     for garment, by_clip in found.items():
         for method in MOTION_METHODS:
             everything = [one for (_, of), ones in by_clip.items() if of == method for one in ones]
-            table.rows += _rows(f"{garment}, all clips", method, everything)
+            table.add(f"{garment}, all clips", method, figures_of(everything) if everything else {})
         for (name, method), ones in by_clip.items():
-            table.rows += _rows(f"{garment}, {name}", method, ones)
+            table.add(f"{garment}, {name}", method, figures_of(ones))
     for body, of_clips in shifts.items():
-        table.rows += SkinShifts.joined(of_clips.values()).rows(f"{body} body, all clips")
-        for name, shift in of_clips.items():
-            table.rows += shift.rows(f"{body} body, {name}")
+        for name, moved in {"all clips": sum(of_clips.values(), SkinShifts()), **of_clips}.items():
+            table.add(f"{body} body, {name}", _SKIN, moved.figures())
     return table
 
 
@@ -138,30 +125,25 @@ class SkinShifts:
         self._largest = max(self._largest, float(way.max()))
         self._moved += int((way > _MOVED).sum())
 
-    @classmethod
-    def joined(cls, parts: Iterable[SkinShifts]) -> SkinShifts:
-        """The shifts of all frames in `parts`."""
-        whole = cls()
-        for part in parts:
-            whole._count += part._count
-            whole._sum += part._sum
-            whole._largest = max(whole._largest, part._largest)
-            whole._moved += part._moved
+    def __add__(self, other: SkinShifts) -> SkinShifts:
+        """The shifts of the frames of both."""
+        whole = SkinShifts()
+        whole._count = self._count + other._count
+        whole._sum, whole._moved = self._sum + other._sum, self._moved + other._moved
+        whole._largest = max(self._largest, other._largest)
         return whole
 
-    def rows(self, group: str) -> list[ResultRow]:
-        """Rows of the mean, 99th percentile (to 0.01 mm) and largest shift, and of the share of vertices that moved."""
+    def figures(self) -> dict[str, float | None]:
+        """The mean, 99th percentile (to 0.01 mm) and largest shift, and the share of vertices that moved."""
         n = int(self._count.sum())
         if not n:
-            return []
-        p99 = int(np.searchsorted(self._count.cumsum(), 0.99 * n)) * _BIN
-        values = {
+            return {}
+        return {
             "shift_mean_mm": 1e3 * self._sum / n,
-            "shift_p99_mm": 1e3 * p99,
+            "shift_p99_mm": 1e3 * int(np.searchsorted(self._count.cumsum(), 0.99 * n)) * _BIN,
             "shift_max_mm": 1e3 * self._largest,
             "shift_moved_percent": 100 * self._moved / n,
         }
-        return [ResultRow.of("motion", group, _SKIN, metric, value) for metric, value in values.items()]
 
 
 @dataclass(frozen=True)
@@ -199,11 +181,6 @@ def figures_of(judged: Sequence[Judged]) -> dict[str, float | None]:
         "self_crossings": float(np.mean([one.n_crossings for one in judged])),
         "layers_cut_percent": 100 * float(np.mean(layers)) if layers else None,
     }
-
-
-def _rows(group: str, method: str, judged: Sequence[Judged]) -> list[ResultRow]:
-    values = figures_of(judged) if judged else {}
-    return [ResultRow.of("motion", group, method, metric, value) for metric, value in values.items()]
 
 
 class OutfitJudge:

@@ -15,8 +15,7 @@ from refu_core.metrics import CollisionChecker
 from refu_lab.plots import COLOURS, new_axes, save_svg
 from refu_lab.render import RenderMesh, Viewpoint, collision_mesh, render, save_png
 from refu_lab.reproduction._build import ENERGY_ZOOM, unseen_groups
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import METHODS
+from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._predict import GarmentSetup, Predictor, SampleScene
 from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, SampleSet, Study
 
@@ -31,7 +30,7 @@ def plot_energy(study: Study, folder: Path) -> list[tuple[str, str]]:
     shown = _shown(study, ("tailornet", "refu-hybrid"))
     if len(shown) < 2:
         return []
-    energies = [np.concatenate([run.values("energy") for run in runs]) for runs in shown.values()]
+    energies = [run.values("energy") for run in shown.values()]
     top = max(float(energy.max()) for energy in energies)
     plots = []
     for file, end in (("energy.svg", max(top, ENERGY_ZOOM)), ("energy_zoom.svg", ENERGY_ZOOM)):
@@ -48,17 +47,16 @@ def plot_energy(study: Study, folder: Path) -> list[tuple[str, str]]:
 def plot_scale(study: Study, folder: Path) -> list[tuple[str, str]]:
     """Writes `scale.svg`: mean α by the ratio of approximate to accurate distance."""
     shown = _shown(study, ("refu-approx", "refu-hybrid"))
-    shown = {label: runs for label, runs in shown.items() if sum(run.scales.count.sum() for run in runs)}
+    shown = {label: run for label, run in shown.items() if run.scales[0].any()}
     if not shown:
         return []
     figure, (ax,) = new_axes(size=_SIZE)
     places = np.arange(len(RATIO_EDGES) - 1)
-    for k, (label, runs) in enumerate(shown.items()):
-        count = np.sum([run.scales.count for run in runs], axis=0)
-        total = np.sum([run.scales.total for run in runs], axis=0)
+    for k, (label, run) in enumerate(shown.items()):
+        count, total = run.scales
         mean = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
         bars = ax.bar(places + 0.4 * k, mean, 0.38, color=COLOURS[k], label=label, align="edge")
-        ax.bar_label(bars, [f"{n:,}" if n else "" for n in count], fontsize=7, rotation=90, padding=3)
+        ax.bar_label(bars, [f"{n:,.0f}" if n else "" for n in count], fontsize=7, rotation=90, padding=3)
     names = [f"({low:g}, {high:g}]" for low, high in itertools.pairwise(RATIO_EDGES)]
     ax.set_xticks(places + 0.4, names, rotation=30, fontsize=8)
     ax.set(xlabel="approximate / accurate distance", ylabel="mean α")
@@ -92,9 +90,9 @@ PLOTS = {"energy": plot_energy, "alpha": plot_scale, "unseen": plot_unseen}
 """The functions that draw the plots of each table."""
 
 
-def _shown(study: Study, methods: tuple[str, ...]) -> dict[str, list[MethodRun]]:
+def _shown(study: Study, methods: tuple[str, ...]) -> dict[str, MethodRun]:
     """The runs of those of the methods that were run on all garments, by label."""
-    return {METHODS[name].label: runs for name in methods if (runs := study.pooled(name))}
+    return {METHODS[name].label: run for name in methods if (run := study.pooled(name)).samples}
 
 
 _SHOT = (420, 560)

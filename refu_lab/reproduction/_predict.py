@@ -21,10 +21,9 @@ from refu_core.frames import SmplFrame
 from refu_core.garments import load_garment, worn_on
 from refu_core.realtime import GarmentPipeline, Outfit, Wearable, Wearer, dress
 from refu_core.refu import Refu, repulse
-from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, RestFaces, SdfSample
+from refu_core.sdf import ApproxSdf, BodySdf, ExactSdf, SdfSample
 from refu_lab.baselines import PostProcess
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import Method
+from refu_lab.reproduction._methods import Library, Method
 
 
 class GarmentSetup:
@@ -42,13 +41,8 @@ class GarmentSetup:
             "approx": self.approx.of_garment(self.template),
         }
         """Functions that give the distances of the garment's own vertices."""
-        self.rest_faces = RestFaces(self.body)
         self.post_process = PostProcess(self.template.faces, self.template.n_vertices)
         self.blend = Blend.of_faces(self.template.faces, self.template.n_vertices)
-
-    def near(self, unposed: Tensor, betas: Tensor) -> Tensor:
-        """A body face near each vertex, shape (N,), of an unposed garment [m], shape (N, 3), for betas (1, 10)."""
-        return self.rest_faces.under(unposed[None], betas, self.template.shapedirs)[0]
 
 
 class SampleScene:
@@ -83,11 +77,11 @@ class MethodOutput(NamedTuple):
     """Garment [m], shape (N, 3)."""
     ms: Mapping[str, float]
     """Wall time by component: backbone (with posing), sdf, refu, post-process; node and its stages [ms]."""
-    scale: Tensor
+    scale: Tensor = torch.zeros(0)
     """α of the vertices that ReFU pushed, shape (R,); empty for other methods."""
-    approx: Tensor
+    approx: Tensor = torch.zeros(0)
     """Their signed distance as ReFU saw it [m], shape (R,)."""
-    accurate: Tensor
+    accurate: Tensor = torch.zeros(0)
     """Their accurate signed distance [m], shape (R,)."""
 
 
@@ -128,14 +122,15 @@ class Predictor:
         points = dressed.turns[0](drape.vertices[0])
         ms = {"backbone": 1e3 * (ended["backbone"] - ended["body"])}
         if self._method.handling == "none" or self._method.sdf is None:
-            return _outcome(points, ms)
+            return MethodOutput(points, ms)
         _, update_ms = scene.sdf(self._method.sdf)
         start = time.perf_counter()
         ask = partial(self._setup.ask[self._method.sdf], on_mean=drape.on_mean[0])
         if self._refu is not None:
             sample = ask(points)
             ms["sdf"] = update_ms + 1e3 * (time.perf_counter() - start)
-            return self._push(self._refu, scene, points, sample, drape.feature, ms)
+            done, ms["refu"], pushed = self._push(self._refu, scene, points, sample, drape.feature)
+            return MethodOutput(done, ms, *pushed)
         if self._method.handling == "naive":
             done = repulse(points, ask(points))  # onto the skin exactly (paper, Sec. 4.5)
         else:
@@ -143,35 +138,23 @@ class Predictor:
             kept = {} if margin is None else {"clearance": margin, "reach": margin if self._method.is_kept else 0.0}
             done = self._setup.post_process.optimise(points, ask, **kept)
         ms["post-process"] = update_ms + 1e3 * (time.perf_counter() - start)
-        return _outcome(done, ms)
+        return MethodOutput(done, ms)
 
     def _push(
-        self,
-        refu: Refu,
-        scene: SampleScene,
-        points: Tensor,
-        sample: SdfSample,
-        z: Tensor | None,
-        ms: dict[str, float],
-    ) -> MethodOutput:
-        """ReFU as in training: one push, no second look."""
+        self, refu: Refu, scene: SampleScene, points: Tensor, sample: SdfSample, z: Tensor | None
+    ) -> tuple[Tensor, float, tuple[Tensor, Tensor, Tensor]]:
+        """ReFU as in training, one push, no second look: the garment, its time [ms], and the rest of the output."""
         start = time.perf_counter()
         batch = SdfSample(sample.distance[None], sample.gradient[None])
         pushed = refu(points[None], batch, z)
         if self._method.is_blended:
             pushed = self._setup.blend.follow(points[None], pushed, refu.margin - batch.distance)
-        done = pushed[0]
-        ms["refu"] = 1e3 * (time.perf_counter() - start)
+        ms = 1e3 * (time.perf_counter() - start)
         rows = torch.nonzero(sample.distance < refu.margin)[:, 0]
         scale, f = refu.of_body(z), sample.distance[rows]
+        scales = torch.full_like(f, scale) if isinstance(scale, float) else scale(rows, f)
         exact, _ = scene.sdf("accurate")
-        return MethodOutput(
-            done,
-            ms,
-            torch.full_like(f, scale) if isinstance(scale, float) else scale(rows, f),
-            f,
-            exact.query(points[rows]).distance,
-        )
+        return pushed[0], ms, (scales, f, exact.query(points[rows]).distance)
 
     def _of_node(self, pipeline: GarmentPipeline, scene: SampleScene) -> MethodOutput:
         frame = SmplFrame(pose=scene.pose[0].numpy(), betas=scene.betas[0].numpy(), style=scene.style[0].numpy())
@@ -179,7 +162,7 @@ class Predictor:
         output = pipeline(frame)
         ms = {"node": 1e3 * (time.perf_counter() - start)}
         ms |= {f"node {stage}": spent for stage, spent in output.stats.stage_ms.items()}
-        return _outcome(torch.tensor(output[self._setup.template.name].local), ms)
+        return MethodOutput(torch.tensor(output[self._setup.template.name].local), ms)
 
 
 def _with_margin(refu: Refu, margin: float | None) -> Refu:
@@ -189,8 +172,3 @@ def _with_margin(refu: Refu, margin: float | None) -> Refu:
     other = Refu.from_config({**refu.config, "margin": margin})
     other.load_state_dict(refu.state_dict())
     return other.eval()
-
-
-def _outcome(vertices: Tensor, ms: Mapping[str, float]) -> MethodOutput:
-    none = vertices.new_zeros(0)
-    return MethodOutput(vertices, ms, none, none, none)

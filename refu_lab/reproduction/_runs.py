@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,8 +19,7 @@ from refu_core.frames import N_STYLES
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
 from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
-from refu_lab.reproduction._load import Library
-from refu_lab.reproduction._methods import METHODS
+from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._predict import GarmentSetup, MethodOutput, Predictor, SampleScene
 from refu_lab.reproduction._tables import Missing
 from refu_lab.truth import garments_of, moments_of
@@ -71,9 +70,8 @@ class SampleSet:
     def open(cls, path: Path) -> SampleSet:
         """The test samples finished so far of the set in the folder `path`, or the samples of a bag with ground truth.
 
-        Raises:
-            RefuError: no such set or bag, a damaged one, one without a finished test sample, or a bag whose truth isn't
-                of one garment.
+        Raises `RefuError`: no such set or bag, a damaged one, one without a finished test sample, or a bag whose truth
+        isn't of one garment.
         """
         if any(one.suffix in BAG_SUFFIXES for one in (path, *path.glob("*"))):
             return _of_bag(path)
@@ -123,80 +121,58 @@ def _of_sequences(dataset: GarmentSequences) -> SampleSet:
     return SampleSet(str(plan["garment"]), len(frames), int(plan["shapes"]), read)
 
 
-@dataclass(eq=False)
-class ScaleByRatio:
-    """Predicted scales α, grouped by the ratio of the approximate to the accurate distance."""
+class SampleResult(NamedTuple):
+    """What a method made of one sample."""
 
-    count: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(RATIO_EDGES) - 1, np.int64))
-    """Number of vertices in each group, shape (11,)."""
-    total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(len(RATIO_EDGES) - 1))
-    """Sum of α in each group, shape (11,)."""
-
-    def join(self, other: ScaleByRatio) -> None:
-        """Adds the counts and sums of another one."""
-        self.count += other.count
-        self.total += other.total
-
-    def add(self, output: MethodOutput) -> None:
-        """Adds the vertices that both distances put inside the body (the supplement's "collision-resolved")."""
-        approx, accurate = output.approx.numpy(), output.accurate.numpy()
-        inside = (approx < 0) & (accurate < 0)
-        group = np.digitize(approx[inside] / accurate[inside], RATIO_EDGES) - 1
-        np.add.at(self.count, group, 1)
-        np.add.at(self.total, group, output.scale.numpy()[inside])
+    figures: FrameMetrics
+    unseen: float
+    """The sample's distance to the training set in (θ, β, γ)."""
+    posture: str | None
+    ms: Mapping[str, float]
+    """Wall time by component [ms]."""
+    scales: NDArray[np.float64]
+    """Number of vertices and sum of α, by ratio of the approximate to the accurate distance, shape (2, 11)."""
 
 
 @dataclass(eq=False)
 class MethodRun:
-    """One method on one garment's test samples."""
+    """One method on the test samples of one garment, or of several."""
 
-    garment: str
     method: str
-    samples: list[FrameMetrics] = field(default_factory=list)
-    """The figures of each sample, in the set's order."""
-    unseen: list[float] = field(default_factory=list)
-    """Each sample's distance to the training set in (θ, β, γ)."""
-    postures: list[str | None] = field(default_factory=list)
-    """Each sample's posture."""
-    ms: dict[str, list[float]] = field(default_factory=dict)
-    """Wall time of each sample by component [ms]."""
-    scales: ScaleByRatio = field(default_factory=ScaleByRatio)
+    samples: list[SampleResult]
+    """In the sets' order."""
 
     @cached_property
     def figures(self) -> Figures:
         """The figures over all samples."""
-        return Figures.over(self.samples)
+        return Figures.over([sample.figures for sample in self.samples])
+
+    @cached_property
+    def scales(self) -> NDArray[np.float64]:
+        """`SampleResult.scales` of all samples together."""
+        return np.asarray(sum(sample.scales for sample in self.samples))
 
     def values(self, name: str) -> NDArray[np.float64]:
         """A field of `FrameMetrics` for all samples."""
-        return np.array([getattr(sample, name) for sample in self.samples], np.float64)
+        return np.array([getattr(sample.figures, name) for sample in self.samples], np.float64)
 
     def median_ms(self, *components: str) -> float | None:
         """Median time of some components together [ms]; None if the method lacks one."""
-        if not self.samples or not set(components) <= set(self.ms):
+        if not self.samples or not set(components) <= set(self.samples[0].ms):
             return None
-        return float(np.median(np.sum([self.ms[component] for component in components], axis=0)))
+        return float(np.median([sum(sample.ms[component] for component in components) for sample in self.samples]))
 
     def of_postures(self, postures: Sequence[str]) -> list[FrameMetrics]:
         """The figures of the samples in these postures."""
-        return [sample for sample, posture in zip(self.samples, self.postures, strict=True) if posture in postures]
+        return [sample.figures for sample in self.samples if sample.posture in postures]
 
-    @classmethod
-    def joined(cls, garment: str, method: str, runs: Iterable[MethodRun]) -> MethodRun:
-        """One run with all samples of `runs`, in their order."""
-        whole = cls(garment, method)
-        for run in runs:
-            whole.join(run)
-        return whole
 
-    def join(self, other: MethodRun) -> None:
-        """Appends the samples of another run."""
-        self.samples += other.samples
-        self.unseen += other.unseen
-        self.postures += other.postures
-        for component, ms in other.ms.items():
-            self.ms.setdefault(component, []).extend(ms)
-        self.scales.join(other.scales)
+def scales_by_ratio(output: MethodOutput) -> NDArray[np.float64]:
+    """`SampleResult.scales`, of the vertices that both distances put inside the body ("collision-resolved")."""
+    approx, accurate = output.approx.numpy(), output.accurate.numpy()
+    inside = (approx < 0) & (accurate < 0)
+    group, n = np.digitize(approx[inside] / accurate[inside], RATIO_EDGES) - 1, len(RATIO_EDGES) - 1
+    return np.stack([np.bincount(group, weights, n) for weights in (None, output.scale.numpy()[inside])])
 
 
 @dataclass(eq=False)
@@ -209,10 +185,11 @@ class Study:
     n_samples: dict[str, int] = field(default_factory=dict)
     """Test samples by garment."""
 
-    def pooled(self, method: str) -> list[MethodRun]:
-        """The method's runs on all garments; none if one is missing, as means would then be over other garments."""
-        runs = [self.runs.get((garment, method)) for garment in self.n_samples]
-        return [run for run in runs if run is not None] if None not in runs else []
+    def pooled(self, method: str) -> MethodRun:
+        """The method on all garments; without samples if one is missing, as means would then be over other garments."""
+        keys = [(garment, method) for garment in self.n_samples]
+        whole = keys if all(key in self.runs for key in keys) else []
+        return MethodRun(method, [sample for key in whole for sample in self.runs[key].samples])
 
 
 def run_methods(
@@ -232,50 +209,46 @@ def run_methods(
     """
     garment = samples.garment
     study.n_samples[garment] = len(samples)
-    setup = GarmentSetup(garment, library)
-    ready: dict[str, Predictor] = {}
-    bases = [METHODS[name].base for name in methods]
-    for name in dict.fromkeys([*bases, *methods]):  # their Laplacian errors are measured against the bases'
+    bases = [METHODS[name].base for name in methods]  # first, as Laplacian errors are measured against theirs
+    prepared = garment, library, tuple(dict.fromkeys([*bases, *methods]))
+    _, ready, missing = _prepared(*prepared)
+    study.missing |= {(garment, one.method): one for one in missing}
+    if not ready:
+        return
+    parts: dict[int, dict[str, list[SampleResult]]] = {}
+    with tqdm(total=len(samples), desc=garment, unit="sample", disable=None if progress else True) as bar:
+        for index, part in (engine or InProcess()).run(partial(_runner, *prepared), _Blocks(samples)):
+            if isinstance(part, Lost) or part.keys() != ready.keys():
+                why = part.reason if isinstance(part, Lost) else "a process hasn't the weights that this one has"
+                msg = f"{garment}: samples {index * _BLOCK} and following are lost: {why}"
+                raise RefuError(msg)
+            parts[index] = part
+            bar.update(len(next(iter(part.values()))))
+    for name in ready:
+        in_order = [sample for index in sorted(parts) for sample in parts[index][name]]  # whatever was done first
+        study.runs[garment, name] = MethodRun(name, in_order)
+
+
+@lru_cache(maxsize=1)
+def _prepared(
+    garment: str, library: Library, methods: tuple[str, ...]
+) -> tuple[GarmentSetup, dict[str, Predictor], list[Missing]]:
+    """What this process needs to run methods, and those that can't be run."""
+    setup, ready, missing = GarmentSetup(garment, library), dict[str, Predictor](), []
+    for name in methods:
         method = METHODS[name]
         try:
             ready[name] = Predictor(method, setup, library)
         except RefuError as error:
-            study.missing[garment, name] = Missing(garment, name, str(error), method.train_command(garment))
-    if not ready:
-        return
-    runner = _Runner(garment, library, tuple(ready), (setup, ready))
-    parts: dict[int, dict[str, MethodRun]] = {}
-    with tqdm(total=len(samples), desc=garment, unit="sample", disable=None if progress else True) as bar:
-        for index, part in (engine or InProcess()).run(runner, _Blocks(samples)):
-            if isinstance(part, Lost):
-                msg = f"{garment}: samples {index * _BLOCK} and following are lost: {part.reason}"
-                raise RefuError(msg)
-            parts[index] = part
-            bar.update(len(next(iter(part.values())).samples))
-    for name in ready:
-        in_order = (parts[index][name] for index in sorted(parts))  # in whatever order they were done
-        study.runs[garment, name] = MethodRun.joined(garment, name, in_order)
+            missing.append(Missing(garment, name, str(error), method.train_command(garment)))
+    return setup, ready, missing
 
 
-@dataclass
-class _Runner:
-    """Makes a process's function, which turns samples into runs."""
-
-    garment: str
-    library: Library
-    methods: tuple[str, ...]
-    """Bases first."""
-    made: tuple[GarmentSetup, Mapping[str, Predictor]] | None = None
-    """Those that this process has already; another process makes its own."""
-
-    def __call__(self) -> Callable[[list[Sample]], dict[str, MethodRun]]:
-        if self.made is None:
-            setup = GarmentSetup(self.garment, self.library)
-            self.made = setup, {name: Predictor(METHODS[name], setup, self.library) for name in self.methods}
-        return partial(_run_samples, *self.made, self.garment)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _Runner, (self.garment, self.library, self.methods)
+def _runner(
+    garment: str, library: Library, methods: tuple[str, ...]
+) -> Callable[[list[Sample]], dict[str, list[SampleResult]]]:
+    setup, ready, _ = _prepared(garment, library, methods)
+    return partial(_run_samples, setup, ready)
 
 
 class _Blocks(Sequence[list[Sample]]):
@@ -293,12 +266,12 @@ class _Blocks(Sequence[list[Sample]]):
 
 
 def _run_samples(
-    setup: GarmentSetup, predictors: Mapping[str, Predictor], garment: str, samples: Sequence[Sample]
-) -> dict[str, MethodRun]:
+    setup: GarmentSetup, predictors: Mapping[str, Predictor], samples: Sequence[Sample]
+) -> dict[str, list[SampleResult]]:
     faces = setup.template.faces.numpy()
     checker = CollisionChecker(setup.body.faces)
     metrics = {name: GarmentMetrics(faces) for name in predictors}
-    runs = {name: MethodRun(garment, name) for name in predictors}
+    done: dict[str, list[SampleResult]] = {name: [] for name in predictors}
     for sample in samples:
         scene = SampleScene(setup, sample.pose, sample.betas, sample.style)
         checker.update(scene.vertices)
@@ -309,12 +282,6 @@ def _run_samples(
             base = METHODS[name].base
             if base == name:
                 colliding[name] = found.inside
-            run = runs[name]
             frame = metrics[name].add(output.vertices, found, truth=sample.vertices, resolved=colliding[base])
-            run.samples.append(frame)
-            run.unseen.append(sample.unseen)
-            run.postures.append(sample.posture)
-            run.scales.add(output)
-            for component, ms in output.ms.items():
-                run.ms.setdefault(component, []).append(ms)
-    return runs
+            done[name].append(SampleResult(frame, sample.unseen, sample.posture, output.ms, scales_by_ratio(output)))
+    return done

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,12 +12,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from refu_core.errors import WeightsError
-from refu_core.sdf import BodySdf
+from refu_core.sdf import BodySdf, NeuralSdf, RestFaces, load_sdf_network
 from refu_core.simulation import posture
-from refu_lab.reproduction._load import Library
+from refu_lab.reproduction._methods import Library
 from refu_lab.reproduction._predict import GarmentSetup, SampleScene
 from refu_lab.reproduction._runs import Sample, SampleSet
-from refu_lab.reproduction._tables import Missing, ResultRow, ResultTable
+from refu_lab.reproduction._tables import Missing, ResultTable
 
 _AT_SURFACE = 1e-4
 """Closer to the skin than this [m], a relative error means nothing."""
@@ -57,13 +57,6 @@ _CLOSE = ", within 2 cm"
 _NAMES = {"approx": "walk over the posed mesh (real time)", "neural": "the paper's network"}
 
 
-class _Asked(NamedTuple):
-    """Distances at the same points [m], each of the shape (P,)."""
-
-    approximate: Tensor
-    accurate: Tensor
-
-
 def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = False) -> ResultTable:
     """Errors of each approximation at (partly disturbed) garment vertices, in the test samples and in folded poses."""
     labels = dict(_NAMES)
@@ -85,11 +78,12 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
         setup = GarmentSetup(garment, library)
         sdfs: dict[str, BodySdf] = {"approx": setup.approx}
         try:
-            sdfs["neural"] = library.load_neural_sdf("paper", garment, setup.body)
+            network = load_sdf_network(library.find("sdf-paper", garment), setup.body)
+            sdfs["neural"] = NeuralSdf(network.eval().requires_grad_(False), setup.body)
         except WeightsError as error:
             command = f"refu train {garment} --data DIR --network sdf --preset paper"
             table.missing.append(Missing(garment, "neural", str(error), command))
-            table.rows += [ResultRow.of("sdf", garment, "neural", metric, None) for metric in sdf_errors([], [])]
+            table.add(garment, "neural", dict.fromkeys(sdf_errors([], [])))
         questions = _Questions(setup, sdfs)
         bodies: dict[bytes, Sample] = {}
         numbers = tqdm(range(len(samples)), desc=f"sdf, {garment}", unit="sample", disable=None if progress else True)
@@ -97,17 +91,17 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
             scene = SampleScene(setup, sample.pose, sample.betas, sample.style)
             questions.ask(scene, torch.from_numpy(sample.vertices))
             bodies.setdefault(sample.betas.tobytes(), sample)
-        for name, asked in questions.answers().items():
-            table.rows += _rows(garment, name, asked)
-            table.rows += _rows(garment, name + _CLOSE, asked, is_close=True)
+        for name, (found, truth) in questions.answers().items():
+            table.add(garment, name, sdf_errors(found, truth))
+            table.add(garment, name + _CLOSE, _close_errors(found, truth))
         for title in FOLDED_POSES:
             pose = posture(title)
             for sample in list(bodies.values())[:_FOLDED_SHAPES]:
                 scene = SampleScene(setup, pose, sample.betas, sample.style)
                 unposed = setup.template.rest(scene.betas, scene.style)
                 questions.ask(scene, setup.template.pose(unposed, scene.transforms)[0])
-            for name, asked in questions.answers().items():
-                table.rows += _rows(garment, f"{name}, {title}", asked, is_close=True)
+            for name, answers in questions.answers().items():
+                table.add(garment, f"{name}, {title}", _close_errors(*answers))
     return table
 
 
@@ -115,36 +109,33 @@ class _Questions:
     """Asks several distances about a garment on bodies, and keeps their answers."""
 
     def __init__(self, setup: GarmentSetup, sdfs: Mapping[str, BodySdf]) -> None:
-        self._setup, self._sdfs = setup, sdfs
+        self._setup, self._sdfs, self._rest_faces = setup, sdfs, RestFaces(setup.body)
         self._random = np.random.default_rng(0)
-        self._asked: dict[str, list[_Asked]] = {name: [] for name in sdfs}
+        self._asked: dict[str, list[NDArray[np.float32]]] = {name: [] for name in sdfs}
 
     def ask(self, scene: SampleScene, vertices: Tensor) -> None:
         """Asks about a garment's vertices [m], shape (N, 3), half of which it disturbs first."""
         disturbance = self._random.normal(scale=DISTURBANCE, size=vertices.shape)
         disturbance[self._random.random(len(disturbance)) < 0.5] = 0
         points = vertices + torch.from_numpy(disturbance.astype(np.float32))
-        unposed = self._setup.template.unpose(points[None], scene.transforms)[0]
-        near = self._setup.near(unposed, scene.betas)
+        template = self._setup.template
+        unposed = template.unpose(points[None], scene.transforms)
+        near = self._rest_faces.under(unposed, scene.betas, template.shapedirs)[0]
         exact, _ = scene.sdf("accurate")
         truth = exact.query(points).distance
         for name, sdf in self._sdfs.items():
             sdf.update(scene.vertices, pose=scene.pose[0], betas=scene.betas[0])
             rows = slice(None, None, 1 if name == "approx" else _POINTS_ASKED)
             distance = sdf.query(points[rows], near=near[rows]).distance.detach()
-            self._asked[name].append(_Asked(distance, truth[rows]))
+            self._asked[name].append(torch.stack((distance, truth[rows])).numpy())
 
-    def answers(self) -> dict[str, _Asked]:
-        """All answers since the last call, by distance."""
-        found = {
-            name: _Asked(*(torch.cat(columns) for columns in zip(*asked, strict=True)))
-            for name, asked in self._asked.items()
-        }
+    def answers(self) -> dict[str, NDArray[np.float32]]:
+        """Approximate and accurate distances [m], shape (2, P), since the last call, by name of the approximation."""
+        found = {name: np.concatenate(asked, axis=1) for name, asked in self._asked.items()}
         self._asked = {name: [] for name in self._sdfs}
         return found
 
 
-def _rows(garment: str, method: str, asked: _Asked, *, is_close: bool = False) -> list[ResultRow]:
-    close = asked.accurate.abs() < (NEAR_SKIN if is_close else float("inf"))
-    errors = sdf_errors(asked.approximate[close].numpy(), asked.accurate[close].numpy())
-    return [ResultRow.of("sdf", garment, method, metric, value) for metric, value in errors.items()]
+def _close_errors(found: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, float | None]:
+    close = np.abs(truth) < NEAR_SKIN
+    return sdf_errors(found[close], truth[close])

@@ -18,7 +18,6 @@ from refu_lab.tables import RESULT_TABLES, TextTable, picture_markdown, write_js
 
 ALL = "all"
 """Stands for all garments, weighted by their numbers of test samples."""
-_NO_VALUE = "–"
 _SUMMARY = "The paper's tables and figures, on simulated data of this project; `refu evaluate` writes these pages."
 _PAPER_NOTE = (
     "*Figures of the paper, in italics, were measured on other data (TailorNet's, of which the authors selected "
@@ -106,9 +105,9 @@ METRICS: Mapping[str, Metric] = {
     "shift_p99_mm": Metric("99th percentile [mm]", 2),
     "shift_max_mm": Metric("largest [mm]", 1),
     "shift_moved_percent": Metric("moved by > 0.1 mm [%]", 2),
-    "mpve_mm_trend": Metric("MPVE, change [%]", 1),
-    "vfcp_percent_trend": Metric("VFCP, change [%]", 1),
-    "cfmp_percent_trend": Metric("CFMP, change [%]", 1, higher_is_better=True),
+    "mpve_mm_trend": Metric("MPVE, change [%]", 1, kind="trend"),
+    "vfcp_percent_trend": Metric("VFCP, change [%]", 1, kind="trend"),
+    "cfmp_percent_trend": Metric("CFMP, change [%]", 1, higher_is_better=True, kind="trend"),
 }
 """The metrics by their names in JSON, without those that a table makes up for its groups (`error [mm] at 1 to 1.5`)."""
 
@@ -123,11 +122,6 @@ class ResultRow(NamedTuple):
     value: float | None
     """None if nothing was measured: networks not trained, or no samples for this metric."""
     paper: float | None
-
-    @classmethod
-    def of(cls, table: str, garment: str, method: str, metric: str, value: float | None) -> ResultRow:
-        """A row with the paper's figure looked up."""
-        return cls(table, garment, method, metric, value, paper_figure(table, garment, method, metric))
 
 
 @dataclass(frozen=True)
@@ -156,6 +150,12 @@ class ResultTable:
     labels: Mapping[str, str] = field(default_factory=dict)
     """Readable names of rows that aren't methods."""
 
+    def add(self, garment: str, method: str, values: Mapping[str, float | None]) -> None:
+        """Adds rows: a method's values by metric, each beside the paper's."""
+        for metric, value in values.items():
+            paper = paper_figure(self.name, garment, method, metric)
+            self.rows.append(ResultRow(self.name, garment, method, metric, value, paper))
+
     def value(self, garment: str, method: str, metric: str) -> float | None:
         """The measured figure; None if there is none."""
         return next((row.value for row in self.rows if row[1:4] == (garment, method, metric)), None)
@@ -183,8 +183,8 @@ class ResultTable:
     def of_garment(self, garment: str) -> list[TextTable]:
         """A garment's figures: a table for each kind of metric."""
         rows = [row for row in self.rows if row.garment == garment]
-        kinds = _unique(_kind(row.metric) for row in rows)
-        return [self._grid(garment, [row for row in rows if _kind(row.metric) == kind]) for kind in kinds]
+        kinds = _unique(_metric(row.metric).kind for row in rows)
+        return [self._grid(garment, [row for row in rows if _metric(row.metric).kind == kind]) for kind in kinds]
 
     def _grid(self, garment: str, rows: Sequence[ResultRow]) -> TextTable:
         """A table of methods by metrics, with a column of the paper's beside each metric that it has any of."""
@@ -194,15 +194,15 @@ class ResultTable:
         absent = {m.method for m in self.missing if m.garment in (garment, ALL)}
         header = ["method"]
         for metric in metrics:
-            header += [label_of(metric), "*paper*"] if metric in in_paper else [label_of(metric)]
+            header += [_metric(metric).label, *(["*paper*"] if metric in in_paper else [])]
         lines = []
         for method in _unique(row.method for row in rows):
             of_method = [found.get((method, metric)) for metric in metrics]
             is_empty = all(row is None or row.value is None for row in of_method)
             cells = [self.label(method) + (" (not measured)" if method in absent and is_empty else "")]
             for metric, row in zip(metrics, of_method, strict=True):
-                cells.append(format_value(metric, row.value if row else None))
-                cells += [f"*{format_value(metric, row.paper if row else None)}*"] if metric in in_paper else []
+                cells.append(_text(metric, row.value if row else None))
+                cells += [f"*{_text(metric, row.paper if row else None)}*"] if metric in in_paper else []
             lines.append(cells)
         return TextTable(f"{self.title}, {garment}", header, lines)
 
@@ -219,18 +219,12 @@ class ResultTable:
     def write(self, folder: Path, *, command: str, n_samples: Mapping[str, int]) -> Path:
         """Writes `<name>.md` and `<name>.json`; returns the page.
 
-        `command` makes the table again; `n_samples` are the numbers of test samples that it is based on.
-
-        Raises:
-            RefuError: the folder can't be written.
+        `command` makes the table again; `n_samples` are the numbers of test samples that it is based on. Raises
+        `RefuError`: the folder can't be written.
         """
         counted = ", ".join(f"{name} {count}" for name, count in n_samples.items())
         of_samples = f" over these numbers of test samples: {counted}" if counted else ""
-        facts = {
-            "samples": dict(n_samples),
-            "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-            "versions": versions("torch", "warp-lang"),
-        }
+        machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
         content = {
             "table": self.name,
             "title": self.title,
@@ -239,7 +233,7 @@ class ResultTable:
             "about": self.about,
             "plots": self.plots,
             "command": command,
-            "facts": facts,
+            "facts": {"samples": dict(n_samples), "machine": machine, "versions": versions("torch", "warp-lang")},
         }
         path = folder / f"{self.name}.md"
         write_page(path, self.markdown(source=f"*Made by `{command}`{of_samples}.*"))
@@ -248,11 +242,7 @@ class ResultTable:
 
 
 def read_table(folder: Path, name: str) -> ResultTable | None:
-    """Reads a table that was written; None if there is none.
-
-    Raises:
-        RefuError: a file that isn't such a table.
-    """
+    """Reads a table that was written; None if there is none. Raises `RefuError`: a file that isn't such a table."""
     path = folder / f"{name}.json"
     if not path.exists():
         return None
@@ -279,10 +269,8 @@ def is_summary(page: Path) -> bool:
 def write_summary(folder: Path) -> Path:
     """Writes `README.md`: links to all tables in the folder, the main one's figures, and the pictures.
 
-    A text about the folder as a whole is taken from its `about.txt`.
-
-    Raises:
-        RefuError: a file that isn't a table, or a folder that can't be written.
+    A text about the folder as a whole is taken from its `about.txt`. Raises `RefuError`: a file that isn't a table, or
+    a folder that can't be written.
     """
     tables: dict[str, Any] = {name: read_table(folder, name) for name in RESULT_TABLES}
     links = [
@@ -296,13 +284,8 @@ def write_summary(folder: Path) -> Path:
     }
     links += [f"- [{title}]({file})" for file, title in others.items() if (folder / file).exists()]
     about = folder / "about.txt"
-    parts = [
-        "# Results",
-        _SUMMARY,
-        *([about.read_text(encoding="utf-8").strip()] if about.exists() else []),
-        "\n".join(links),
-        _PAPER_NOTE,
-    ]
+    parts = ["# Results", _SUMMARY, *([about.read_text(encoding="utf-8").strip()] if about.exists() else [])]
+    parts += ["\n".join(links), _PAPER_NOTE]
     main: ResultTable | None = tables["comparison"]
     if main is not None:
         grids = main.in_short()
@@ -313,17 +296,15 @@ def write_summary(folder: Path) -> Path:
     return folder / "README.md"
 
 
-def label_of(metric: str) -> str:
-    """A metric's readable name."""
-    return METRICS[metric].label if metric in METRICS else metric
+def _metric(name: str) -> Metric:
+    """How a metric is written; those that a table makes up for its groups have one table a kind of group."""
+    return METRICS.get(name) or Metric(name, 3, kind=name.split(" at ")[0])
 
 
-def format_value(metric: str, value: float | None) -> str:
+def _text(metric: str, value: float | None) -> str:
     """A figure as text; a dash if there is none."""
-    if value is None:
-        return _NO_VALUE
     signed = "+" if metric.endswith("_trend") else ""
-    return f"{value:{signed}.{METRICS[metric].digits if metric in METRICS else 3}f}"
+    return "–" if value is None else f"{value:{signed}.{_metric(metric).digits}f}"
 
 
 def weighted(values: Iterable[tuple[float | None, int]]) -> float | None:
@@ -335,12 +316,6 @@ def weighted(values: Iterable[tuple[float | None, int]]) -> float | None:
     total = sum(count for _, count in pairs)
     known = [(value, count) for value, count in pairs if value is not None]
     return sum(value * count / total for value, count in known) if total and len(known) == len(pairs) else None
-
-
-def _kind(metric: str) -> str:
-    if metric.endswith("_trend"):
-        return "trend"
-    return METRICS[metric].kind if metric in METRICS else metric.split(" at ")[0]
 
 
 def _unique(values: Iterable[str]) -> list[str]:

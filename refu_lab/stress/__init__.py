@@ -1,30 +1,7 @@
 """Measures numerical stability: everyday and hostile frames, what collision handling promises, and endurance."""
 
-from refu_lab.stress._checks import CHECKS as CHECKS
-from refu_lab.stress._frames import FRAMES as FRAMES
-from refu_lab.stress._frames import everyday as everyday
-from refu_lab.stress._frames import promised as promised
-from refu_lab.stress._invariance import mirror_image as mirror_image
 from refu_lab.stress._rounds import StressResult as StressResult
-from refu_lab.stress._rounds import length as length
 from refu_lab.stress._rounds import replay_trial as replay_trial
 from refu_lab.stress._rounds import run_stress as run_stress
 from refu_lab.stress._rounds import stress_table as stress_table
-from refu_lab.stress._soak import JUDGED_FROM as JUDGED_FROM
-from refu_lab.stress._soak import TOLERANCE as TOLERANCE
-from refu_lab.stress._soak import SoakResult as SoakResult
-from refu_lab.stress._soak import Yardstick as Yardstick
-from refu_lab.stress._soak import is_slower as is_slower
 from refu_lab.stress._soak import resident_mb as resident_mb
-from refu_lab.stress._soak import soak as soak
-from refu_lab.stress._soak import soak_frames as soak_frames
-from refu_lab.stress._subject import Subject as Subject
-from refu_lab.stress._subject import Wardrobe as Wardrobe
-from refu_lab.stress._subject import distance_to_mesh as distance_to_mesh
-from refu_lab.stress._trial import Check as Check
-from refu_lab.stress._trial import Measurement as Measurement
-from refu_lab.stress._trial import StressError as StressError
-from refu_lab.stress._trial import Tally as Tally
-from refu_lab.stress._trial import Trial as Trial
-from refu_lab.stress._trial import load_trial as load_trial
-from refu_lab.stress._trial import save_trial as save_trial

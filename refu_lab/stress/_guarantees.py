@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,7 @@ from refu_core.modes import DEFAULT_MARGIN
 from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput, Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
 from refu_lab.stress._numbers import n_not_finite
-from refu_lab.stress._subject import Subject
-from refu_lab.stress._trial import Measurement, Trial
+from refu_lab.stress._trial import Measurement, Subject, Trial
 
 DEPTH = 1e-4
 """No vertex may be deeper inside the collider than this [m]."""
@@ -104,11 +104,9 @@ def not_thrown(subject: Subject, trial: Trial) -> Iterator[Measurement]:
         _, lack = _closest_skin(subject, out, torch.tensor(mesh.raw))
         moved = np.linalg.norm(mesh.local - mesh.raw, axis=1)
         near = _largest_near(lack, pipeline.garments[name].edges.numpy())
-        limit = (
-            np.minimum(MAX_DISPLACEMENT, MULTIPLE * (near + DEFAULT_MARGIN)) + _pressed(subject, trial.frames[0])[name]
-        )
+        limit = np.minimum(MAX_DISPLACEMENT, MULTIPLE * (near + DEFAULT_MARGIN)) + _BOUND_SLACK
         yield _finite(out)
-        yield _farthest(moved, limit + _BOUND_SLACK)
+        yield _farthest(moved, limit + _pressed(subject, trial.frames[0])[name])
 
 
 def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
@@ -120,46 +118,33 @@ def bounded(subject: Subject, trial: Trial) -> Iterator[Measurement]:
         yield _farthest(moved, _pressed(subject, trial.frames[0])[name] + MAX_DISPLACEMENT + _BOUND_SLACK)
 
 
-def no_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+def no_jumps(subject: Subject, trial: Trial, *, together: bool = False) -> Iterator[Measurement]:
     """Compares how far vertices go from frame to frame, each garment worn alone, with the body's fastest vertex.
 
     Pushed vertices go to the closest skin. That leaps from one side of a limb's medial axis to the other where another
     way out becomes the shortest, and no projection without memory can follow it smoothly. So vertices may go farther by
-    as much as the closest skin of pushed vertices near them moves.
+    as much as the closest skin of pushed vertices near them moves; of garments worn `together`, the closest point of
+    the garment below may leap, too.
     """
-    for pipeline in subject.one_by_one.values():
-        yield from _jumps(subject, pipeline, trial)
-
-
-def no_jumps_together(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The same for garments worn over each other, where the closest point of the garment below may leap, too."""
-    return _jumps(subject, subject.pipeline, trial)
-
-
-def _jumps(subject: Subject, pipeline: GarmentPipeline, trial: Trial) -> Iterator[Measurement]:
-    before: dict[str, _Aims] = {}
-    for last, out in _pairs(pipeline, trial):
-        yield _finite(out)
-        aims = _aims(subject, pipeline, out)
-        for name, mesh in out.items() if last is not None else ():
+    for pipeline in [subject.pipeline] if together else subject.one_by_one.values():
+        told = [(out := pipeline(frame), _aims(subject, pipeline, out)) for frame in trial.frames]
+        yield from (_finite(out) for out, _ in told)
+        for (last, before), (out, aims) in pairwise(told):
             pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max()) + PACE_SLACK
-            limit = pace + _leap(before[name], aims[name], pipeline.garments[name].edges.numpy())
-            way = np.linalg.norm(mesh.local - last[name].local, axis=1)
-            yield _farthest(way, limit)
-        before = aims
+            for name, mesh in out.items():
+                leap = _leap(before[name], aims[name], pipeline.garments[name].edges.numpy())
+                yield _farthest(np.linalg.norm(mesh.local - last[name].local, axis=1), pace + leap)
 
 
 def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     """As limbs go through each other, vertices may go from one bound of the displacement to the other, no farther."""
-    before: dict[str, NDArray[np.floating]] = {}
-    for frame, (last, out) in zip(trial.frames, _pairs(subject.pipeline, trial), strict=True):
-        yield _finite(out)
-        pressed = _pressed(subject, frame, together=True)
-        for name, mesh in out.items() if last is not None else ():
-            pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max())
+    told = [(subject.pipeline(frame), _pressed(subject, frame, together=True)) for frame in trial.frames]
+    yield from (_finite(out) for out, _ in told)
+    for (last, before), (out, pressed) in pairwise(told):
+        pace = PACE * float(np.linalg.norm(out.body - last.body, axis=1).max())
+        for name, mesh in out.items():
             way = np.linalg.norm(mesh.local - last[name].local, axis=1)
             yield _farthest(way, pace + 2 * MAX_DISPLACEMENT + before[name] + pressed[name])
-        before = pressed
 
 
 def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> dict[str, NDArray[np.floating]]:
@@ -181,15 +166,6 @@ def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> d
             pressed = stage.press(name, flat)
             ways[name] = stage.own_side(name, pressed, one.on_mean[0], DEFAULT_MARGIN + ASKED_FROM)[0] - raw
     return {name: np.linalg.norm(way.numpy(), axis=1) for name, way in ways.items()}
-
-
-def _pairs(pipeline: GarmentPipeline, trial: Trial) -> Iterator[tuple[Any, PipelineOutput]]:
-    """Yields, for each frame, the previous frame's output (None at first) and its own."""
-    last = None
-    for frame in trial.frames:
-        out = pipeline(frame)
-        yield last, out
-        last = out
 
 
 def _farthest(way: NDArray[np.floating], limit: NDArray[np.floating]) -> Measurement:

@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.body import MIRRORED_JOINTS
 from refu_core.frames import SmplFrame
-from refu_core.realtime import PipelineOutput
+from refu_core.realtime import GarmentMesh
 from refu_lab.stress._frames import frame_of
 from refu_lab.stress._numbers import ROUNDING
-from refu_lab.stress._subject import Subject, distance_to_mesh
-from refu_lab.stress._trial import Measurement, Trial
+from refu_lab.stress._trial import Measurement, Subject, Trial, distance_to_mesh
 
 RIGID = 1e-4
 """Largest deviation of a garment that has to follow its person [m]."""
@@ -99,8 +98,7 @@ def history(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 def batch(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     """Compares persons dressed together with the same persons one by one, before collision handling."""
     for alone, together in _alone_and_together(subject, trial):
-        for name, mesh in alone.items():
-            yield _apart(mesh.raw, together[name].raw, ROUNDING)
+        yield _apart(alone.raw, together.raw, ROUNDING)
 
 
 def batch_resolved(subject: Subject, trial: Trial) -> Iterator[Measurement]:
@@ -110,15 +108,14 @@ def batch_resolved(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     single vertex is still subject to the bound of displacements, which has a check of its own.
     """
     for alone, together in _alone_and_together(subject, trial):
-        for name, mesh in alone.items():
-            way = np.linalg.norm(mesh.local - together[name].local, axis=1)
-            yield Measurement(deviation=float(np.quantile(way, 1 - _UNDECIDED)), limit=RIGID)
+        way = np.linalg.norm(alone.local - together.local, axis=1)
+        yield Measurement(deviation=float(np.quantile(way, 1 - _UNDECIDED)), limit=RIGID)
 
 
-def _alone_and_together(subject: Subject, trial: Trial) -> Iterator[tuple[PipelineOutput, PipelineOutput]]:
+def _alone_and_together(subject: Subject, trial: Trial) -> Iterator[tuple[GarmentMesh, GarmentMesh]]:
     outs = subject.pipeline(trial.frames)
     for i in np.random.default_rng(0).choice(len(trial.frames), ALONE, replace=False):
-        yield subject.pipeline(trial.frames[i]), outs[i]
+        yield from ((mesh, outs[i][name]) for name, mesh in subject.pipeline(trial.frames[i]).items())
 
 
 def _apart(a: NDArray[np.floating], b: NDArray[np.floating], limit: float) -> Measurement:

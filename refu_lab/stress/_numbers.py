@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.sdf import ExactSdf
-from refu_lab.stress._subject import Subject, distance_to_mesh
-from refu_lab.stress._trial import Measurement, Trial
+from refu_lab.stress._trial import Measurement, Subject, Trial, distance_to_mesh, predicted
 
 ROUNDING = 5e-6
 """Rounding error allowed for float32 on a body of a metre or two [m]: fifty times its resolution there."""
@@ -25,38 +24,30 @@ _COLLAPSED = 40
 """Number of faces whose corners are put in one place or in line."""
 
 
-def against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
+def against_float64(subject: Subject, trial: Trial, *, on_collider: bool = False) -> Iterator[Measurement]:
     """Compares bodies and garments before collision handling in float32, the first also by the pipeline, with float64.
 
-    The limit grows with the size of the result and with the angles: float32 resolves 1,000 rad to 6e-5.
+    Garments are on the skin, or on the collider. The limit grows with the size of the result and with the angles:
+    float32 resolves 1,000 rad to 6e-5.
     """
-    yield from _compared(subject.on_skin, trial, ROUNDING)
-    out = subject.pipeline(trial.frames[0])
-    yield Measurement(
-        nan=n_not_finite(out.body, *(mesh.raw for mesh in out.values()), *(m.vertices for m in out.values()))
-    )
-
-
-def collider_against_float64(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-    """The same with the collider, and with garments on it."""
-    yield from _compared(subject, trial, COLLIDER_ROUNDING)
-
-
-def _compared(subject: Subject, trial: Trial, rounding: float) -> Iterator[Measurement]:
-    out = subject.pipeline(trial.frames[0])
+    worn = subject if on_collider else subject.on_skin
+    out = worn.pipeline(trial.frames[0])
     first = [out.body, *(mesh.raw for mesh in out.values())]
-    ours, wanted = subject.in_float32(trial.frames), subject.in_float64(trial.frames)
+    ours, wanted = (predicted(outfit, trial.frames) for outfit in (worn.pipeline.outfit, worn.outfit64))
     turn = 1 + np.array([np.linalg.norm(frame.pose, axis=1).max() for frame in trial.frames]) / np.pi
-    deviation = np.zeros(len(trial.frames))
-    limit = np.zeros_like(deviation)
+    deviation, limit = np.zeros((2, len(trial.frames)))
     for got, whole, right in zip(ours, first, wanted, strict=True):
         error = np.abs(got - right).max((1, 2))
         error[0] = max(error[0], np.abs(whole - right[0]).max())
+        rounding = COLLIDER_ROUNDING if on_collider else ROUNDING
         limit = np.maximum(limit, rounding * turn * np.abs(right).max((1, 2), initial=1.0))
         deviation = np.maximum(deviation, error)
     for i in range(len(trial.frames)):
         yield Measurement(deviation=float(deviation[i]), limit=float(limit[i]), culprit=i)
     yield Measurement(nan=n_not_finite(*first, *(mesh.vertices for mesh in out.values()), *ours))
+    if not on_collider:
+        out = subject.pipeline(trial.frames[0])
+        yield Measurement(nan=n_not_finite(out.body, *(m for mesh in out.values() for m in (mesh.raw, mesh.vertices))))
 
 
 def n_not_finite(*arrays: NDArray[np.floating]) -> int:

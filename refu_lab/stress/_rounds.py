@@ -1,28 +1,160 @@
-"""What `refu stress` does: runs all checks, round after round, and the soaks; prints the table."""
+"""What `refu stress` does: the table of checks, round after round of them, the soaks, and what is printed."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from refu_core._device import one_thread
+from refu_core.errors import FrameError
+from refu_core.frames import N_BETAS, N_STYLES
 from refu_core.garments import load_garment
 from refu_core.weights import weights_folder
 from refu_lab.commands.stress import StressOptions
-from refu_lab.stress._checks import CHECKS
+from refu_lab.stress import _guarantees as guarantees
+from refu_lab.stress import _invariance as invariance
+from refu_lab.stress import _numbers as numbers
+from refu_lab.stress._frames import FRAMES, Draw, between, everyday, everyday_pose, frame_of, promised
 from refu_lab.stress._soak import SoakResult, soak
-from refu_lab.stress._subject import Subject, Wardrobe
-from refu_lab.stress._trial import Check, Measurement, StressError, Tally, load_trial, save_trial
+from refu_lab.stress._trial import (
+    Check,
+    Measurement,
+    StressError,
+    Subject,
+    Tally,
+    Trial,
+    Wardrobe,
+    load_trial,
+    save_trial,
+)
 from refu_lab.tables import format_table
+
+DrawTrial = Callable[[np.random.Generator], Trial]
+
+_FRAMES = 64
+"""Frames in a trial of numbers, and persons in a batch."""
+_STEPS = 24
+"""Frames of a motion."""
+
+
+def _many(draw: Draw) -> DrawTrial:
+    """Draws trials of 64 frames; the pipeline never sees those that `SmplFrame` itself refuses."""
+
+    def trial(rng: np.random.Generator) -> Trial:
+        frames = []
+        for _ in range(_FRAMES):
+            with contextlib.suppress(FrameError):
+                frames.append(draw(rng))
+        return Trial(tuple(frames), refused=_FRAMES - len(frames))
+
+    return trial
+
+
+def _calm(share: float, *, in_room: bool = False) -> DrawTrial:
+    """Draws scaled-down everyday poses, in which most bodies don't touch themselves, at the origin or in a room."""
+
+    def trial(rng: np.random.Generator) -> Trial:
+        pose, betas = share * everyday_pose(rng), rng.normal(0, 1, N_BETAS)
+        transl = rng.normal(0, 3, 3) if in_room else np.zeros(3)
+        return Trial((frame_of(pose, betas, transl),), int(rng.integers(2**31)))
+
+    return trial
+
+
+_calm_day = _calm(0.6, in_room=True)
+
+
+def _any_day(rng: np.random.Generator) -> Trial:
+    return Trial((everyday(rng),)) if rng.random() < 0.5 else _calm_day(rng)
+
+
+def _promised(rng: np.random.Generator) -> Trial:
+    return Trial((promised(rng),))
+
+
+def _any_frame(rng: np.random.Generator) -> Trial:
+    names = [name for name in FRAMES if name != "absurd"]
+    return Trial((FRAMES[names[rng.integers(len(names))]](rng),))
+
+
+def _wide(rng: np.random.Generator) -> Trial:
+    """Half of the trials are within the promised range, half anywhere."""
+    return _promised(rng) if rng.random() < 0.5 else _any_frame(rng)
+
+
+def _motion(rng: np.random.Generator) -> Trial:
+    betas, style = rng.normal(0, 1, N_BETAS), rng.normal(0, 1, N_STYLES)
+    poses = [0.7 * everyday_pose(rng) for _ in range(2)]
+    return Trial(tuple(frame_of(pose, betas, style=style) for pose in between(poses, _STEPS)))
+
+
+def _folding(rng: np.random.Generator) -> Trial:
+    """Motion from an everyday pose to one with limbs through the trunk."""
+    last = FRAMES["limbs through the trunk"](rng)
+    poses: list[NDArray[np.floating]] = [0.7 * everyday_pose(rng), last.pose]
+    return Trial(tuple(frame_of(pose, last.betas) for pose in between(poses, _STEPS)))
+
+
+def _teleport(rng: np.random.Generator) -> Trial:
+    """Frames each of which is far from the one before."""
+    names = ("everyday", "any rotation of any joint", "limbs through the trunk", "betas of 5", "angles beyond a turn")
+    return Trial((*(FRAMES[name](rng) for name in rng.permutation(names)), everyday(rng)))
+
+
+def _crowd(rng: np.random.Generator) -> Trial:
+    return Trial(tuple(_calm(0.6)(rng).frames[0] for _ in range(_FRAMES)))
+
+
+CHECKS: dict[str, Check] = {
+    check.name: check
+    for check in (
+        *(Check(f"numbers: {name}", _many(draw), numbers.against_float64) for name, draw in FRAMES.items()),
+        Check(
+            "numbers: collider, everyday", _many(FRAMES["everyday"]), partial(numbers.against_float64, on_collider=True)
+        ),
+        *(
+            Check(f"numbers: distance, {name}", _calm(0.5), numbers.distances(place))
+            for name, place in numbers.POINTS.items()
+        ),
+        Check("guarantees: nothing inside", _any_day, guarantees.nothing_inside, trials=4, needs_sdf=True),
+        Check("guarantees: nothing inside, garment buried in the body", _calm_day, guarantees.buried, needs_sdf=True),
+        Check(
+            "guarantees: nothing inside, promised poses and shapes",
+            _promised,
+            guarantees.nothing_inside,
+            8,
+            needs_sdf=True,
+        ),
+        Check("guarantees: whatever is inside is counted", _wide, guarantees.counted, trials=8),
+        Check("guarantees: no vertex thrown out", _any_day, guarantees.not_thrown, trials=2),
+        Check("guarantees: displacement bounded in any pose", _any_frame, guarantees.bounded, trials=4),
+        Check("guarantees: no jumps in smooth motion", _motion, guarantees.no_jumps),
+        Check(
+            "guarantees: no jumps in smooth motion, worn together", _motion, partial(guarantees.no_jumps, together=True)
+        ),
+        Check("guarantees: bounded jumps through self-contact", _folding, guarantees.bounded_jumps),
+        Check("invariance: the person turned", _calm(0.6), invariance.turned, trials=2, repeats=1),
+        Check("invariance: the person 100 km away", _calm(0.6), invariance.moved, trials=2, repeats=1),
+        Check("invariance: left and right exchanged", _calm(0.6), invariance.mirrored, repeats=1),
+        Check("invariance: what came before", _teleport, invariance.history, repeats=2),
+        Check("invariance: a batch of 64, predicted", _crowd, invariance.batch, repeats=invariance.ALONE),
+        Check("invariance: a batch of 64, resolved", _crowd, invariance.batch_resolved, repeats=invariance.ALONE),
+    )
+}
+"""All checks by name; each round runs them in this order."""
+
 
 _SOAK_SHARE = 0.3
 """Share of a long run's time."""
@@ -40,25 +172,21 @@ class StressResult:
     """Files of the worst cases."""
 
     @property
-    def _all(self) -> list[Tally | SoakResult]:
-        return [*self.tallies, *self.soaks]
-
-    @property
     def failures(self) -> int:
         """Number of failed trials, and of limits that soaks exceeded."""
-        return sum(row.failures for row in self._all)
+        return sum(one.failures for one in self.tallies) + sum(one.failures for one in self.soaks)
 
     def as_dict(self) -> dict[str, Any]:
         """The results, ready for JSON."""
-        return {"rows": [row.as_dict() for row in self._all], "left_out": self.left_out, "failures": self.failures}
+        rows = [one.as_dict() for one in self.tallies] + [one.as_dict() for one in self.soaks]
+        return {"rows": rows, "left_out": self.left_out, "failures": self.failures}
 
 
 def run_stress(options: StressOptions, *, progress: bool) -> StressResult:
     """Runs everything that the options ask for.
 
-    Raises:
-        StressError: there is nothing to try: no such part, or no weights of any garment.
-        RefuError: as `GarmentPipeline.load`.
+    Raises `StressError`: there is nothing to try: no such part, or no weights of any garment; `RefuError`: as
+    `GarmentPipeline.load`.
     """
     wardrobes, left_out = _wardrobes(options)
     result = StressResult(left_out=left_out)
@@ -142,9 +270,7 @@ def _save_worst(tallies: Sequence[Tally], folder: Path) -> list[Path]:
 def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = True) -> Tally:
     """Runs a trial again that `refu stress` has saved.
 
-    Raises:
-        StressError: the file can't be read, or its check doesn't exist.
-        RefuError: as `GarmentPipeline.load`.
+    Raises `StressError`: the file can't be read, or its check doesn't exist; `RefuError`: as `GarmentPipeline.load`.
     """
     name, wardrobe, trial = load_trial(path)
     if name not in CHECKS:
@@ -158,49 +284,34 @@ def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = Tr
 
 def stress_table(result: StressResult) -> str:
     """What `refu stress` prints: all rows, the faults, and where the worst cases are."""
-    lines = []
+    lines, rows = list[str](), list[tuple[str, ...]]()
     if result.tallies:
-        rows = []
         for tally in result.tallies:
             worst = tally.worst or Measurement()
             counts = (tally.runs, tally.failures, tally.nan, tally.refused)
             rows.append((tally.case, tally.mode, *map(str, counts), length(worst.deviation), length(worst.limit)))
-        lines += [
-            format_table(("case", "mode", "runs", "failures", "NaN", "refused", "deviation", "limit"), rows),
-            "(deviation and limit are those of the worst trial; a few limits depend on the frame)",
-            "",
-        ]
+        header: tuple[str, ...] = ("case", "mode", "runs", "failures", "NaN", "refused", "deviation", "limit")
+        note = "(deviation and limit are those of the worst trial; a few limits depend on the frame)"
+        lines += [format_table(header, rows), note, ""]
     if result.soaks:
         header = ("soak", "frames", "NaN", "memory MB", "", "p99 ms", "", "wall p99 ms", "machine")
-        soaks = [
-            (
-                soak.mode,
-                f"{soak.frames} by {soak.persons}",
-                str(soak.nan),
-                _first_last("{:.0f}", soak.tenths_mb),
-                f"{100 * soak.growth:+.1f} %",
-                _first_last("{:.1f}", soak.tenths_ms),
-                f"{100 * soak.slowdown:+.1f} %",
-                _first_last("{:.1f}", soak.tenths_wall_ms),
-                f"{100 * soak.machine_slowdown:+.1f} %",
+        rows = []
+        for one in result.soaks:
+            mb, ms, wall = (
+                f"{one.tenths[name][0]:.{digits}f} → {one.tenths[name][-1]:.{digits}f}"
+                for name, digits in (("mb", 0), ("ms", 1), ("wall_ms", 1))
             )
-            for soak in result.soaks
-        ]
-        lines += [
-            format_table(header, soaks),
-            "(first tenth → last tenth; machine: of the processor time of a fixed piece of work)",
-            "",
-        ]
+            more, slower, machine = (f"{100 * one.growth(name):+.1f} %" for name in ("mb", "ms", "yardstick_ms"))
+            frames = f"{one.frames} by {one.persons}"
+            rows.append((one.mode, frames, str(one.nan), mb, more, ms, slower, wall, machine))
+        note = "(first tenth → last tenth; machine: of the processor time of a fixed piece of work)"
+        lines += [format_table(header, rows), note, ""]
     lines += [f"{tally.case} ({tally.mode}): {fault}" for tally in result.tallies for fault in tally.faults]
     lines += [f"left out: {text}" for text in result.left_out]
     if result.files:
         lines.append(f"worst cases: {result.files[0].parent}/*.npz, to be tried again with refu stress --replay FILE")
     lines.append("nothing failed" if not result.failures else f"{result.failures} FAILED")
     return "\n".join(lines)
-
-
-def _first_last(form: str, tenths: tuple[float, ...]) -> str:
-    return f"{form.format(tenths[0])} → {form.format(tenths[-1])}"
 
 
 def length(metres: float) -> str:

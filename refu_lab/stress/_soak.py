@@ -6,8 +6,8 @@ import contextlib
 import math
 import resource
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,43 +43,28 @@ class SoakResult:
     nan: int
     """Numbers in the output that aren't finite."""
     seconds: float
-    tenths_mb: tuple[float, ...]
-    """Largest resident memory in each tenth [MB]."""
-    tenths_ms: tuple[float, ...]
-    """99th percentile of a call's processor time in each tenth [ms]."""
-    tenths_wall_ms: tuple[float, ...]
-    """The same for wall time, which other processes lengthen [ms]."""
-    tenths_yardstick_ms: tuple[float, ...]
-    """The same for the processor time of the yardstick, which always does the same work [ms]."""
+    tenths: Mapping[str, tuple[float, ...]]
+    """In each tenth: the largest resident memory (`mb`), and 99th percentiles of a call's processor time (`ms`), of its
+    wall time, which other processes lengthen (`wall_ms`), and of the yardstick's processor time (`yardstick_ms`)."""
 
-    @property
-    def growth(self) -> float:
-        """Growth of the memory, as a share of the first tenth's."""
-        return _growth(self.tenths_mb)
-
-    @property
-    def slowdown(self) -> float:
-        """Growth of the processor time's 99th percentile, likewise."""
-        return _growth(self.tenths_ms)
-
-    @property
-    def machine_slowdown(self) -> float:
-        """Growth of the yardstick's time, likewise: how much slower the machine itself has become."""
-        return _growth(self.tenths_yardstick_ms)
+    def growth(self, what: str) -> float:
+        """Growth from the first to the last tenth of one of `tenths`, as a share of the first."""
+        return self.tenths[what][-1] / self.tenths[what][0] - 1
 
     @property
     def failures(self) -> int:
         """How many of these failed: memory, latency (given enough calls, by clock and by yardstick), numbers."""
-        times, is_judged = 1 + self.slowdown, self.frames >= JUDGED_FROM * self.persons
-        slower = is_judged and is_slower(times, times, 1 + self.machine_slowdown)
-        return (self.growth > TOLERANCE) + slower + (self.nan > 0)
+        times, is_judged = 1 + self.growth("ms"), self.frames >= JUDGED_FROM * self.persons
+        slower = is_judged and is_slower(times, times, 1 + self.growth("yardstick_ms"))
+        return (self.growth("mb") > TOLERANCE) + slower + (self.nan > 0)
 
     def as_dict(self) -> dict[str, Any]:
         """A row of the results, ready for JSON."""
-        row = {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0} | asdict(self)
-        del row["frames"]
-        judged = ("growth", "slowdown", "machine_slowdown", "failures")
-        return row | {name: getattr(self, name) for name in judged}
+        row: dict[str, Any] = {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0}
+        row |= {name: getattr(self, name) for name in ("mode", "persons", "nan", "seconds", "failures")}
+        row |= {f"tenths_{name}": values for name, values in self.tenths.items()}
+        growths = (("growth", "mb"), ("slowdown", "ms"), ("machine_slowdown", "yardstick_ms"))
+        return row | {name: self.growth(what) for name, what in growths}
 
 
 def soak_frames(rng: np.random.Generator) -> list[SmplFrame]:
@@ -102,10 +87,8 @@ def soak(
     """Runs the same motions over and over, until `frames` or `seconds` are reached, and measures each tenth of the run.
 
     Each of the `persons` in a call has their own motion and counts as a frame; `tick` is called with the number of
-    frames after each call. After an interrupt (Ctrl-C) the tenths are those of the run so far.
-
-    Raises:
-        StressError: `frames` give fewer than ten calls, which have no tenths.
+    frames after each call. After an interrupt (Ctrl-C) the tenths are those of the run so far. Raises `StressError`:
+    `frames` give fewer than ten calls, which have no tenths.
     """
     calls = -(-frames // persons)
     if calls < _FEWEST:
@@ -127,19 +110,14 @@ def soak(
             log[:, n] = resident_mb(), cpu, wall, same
             n += 1
             tick(persons)
-    memory, *times = (np.array_split(row[:n], 10) for row in log)
-    of_cpu, of_wall, of_yardstick = (tuple(float(np.percentile(tenth, 99)) for tenth in tenths) for tenths in times)
-    return SoakResult(
-        mode=mode,
-        frames=n * persons,
-        persons=persons,
-        nan=nan,
-        seconds=time.perf_counter() - start,
-        tenths_mb=tuple(float(tenth.max()) for tenth in memory),
-        tenths_ms=of_cpu,
-        tenths_wall_ms=of_wall,
-        tenths_yardstick_ms=of_yardstick,
-    )
+    tenths = {
+        name: tuple(float(np.percentile(tenth, share)) for tenth in np.array_split(row[:n], 10))
+        for (name, share), row in zip(
+            (("mb", 100), ("ms", 99), ("wall_ms", 99), ("yardstick_ms", 99)), log, strict=True
+        )
+    }
+    seconds = time.perf_counter() - start
+    return SoakResult(mode=mode, frames=n * persons, persons=persons, nan=nan, seconds=seconds, tenths=tenths)
 
 
 class Yardstick:
@@ -170,7 +148,3 @@ def is_slower(later: float, longer: float, machine: float) -> bool:
     lateness alone, which any other process that needs the processor can cause.
     """
     return min(later, longer / machine) > 1 + TOLERANCE
-
-
-def _growth(tenths: Sequence[float]) -> float:
-    return tenths[-1] / tenths[0] - 1

@@ -18,10 +18,10 @@ from refu_core.history import PoseHistory
 from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
-from refu_lab.view._film import BODY, SKIN, Cache, SceneMesh
+from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -62,7 +62,6 @@ class DressedFilm:
         self._pipeline = options.load_pipeline()
         self._given = dict(zip(self.garments, options.garments, strict=True))
         """What each garment was asked for by: some are files."""
-        self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: drawing compares identities
         self.notes: list[str] = []
         """Warnings for the user."""
         names = _different([path.stem for path in inputs]) if len(inputs) > 1 else [""]
@@ -71,7 +70,7 @@ class DressedFilm:
         self._moments = longest.times
         first = self._tracks[0]
         self._origin = first.turn @ first.frames[0].transl
-        self._cache, self._facts = Cache(), dict[int, list[str]]()
+        self._begin()
         self.title = ", ".join(path.name for path in inputs)
 
     @property
@@ -109,50 +108,43 @@ class DressedFilm:
         names = tuple(self._given.get(name, name) for name in garments)
         options = replace(self._options, garments=names, sdf=sdf)
         self._pipeline, self._options = options.load_pipeline(), options
-        self._body_faces = self._pipeline.body.faces.cpu().numpy()
-        self._cache.clear()
-        self._facts.clear()
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forgets what was dressed by another pipeline."""
+        self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: drawing compares identities
+        n_vertices = 2 * self._pipeline.body.n_vertices
+        n_vertices += sum(one.n_vertices for one in self._pipeline.garments.values())
+        self._dressed = remembering(self._dress, frame_bytes=12 * n_vertices * len(self._tracks))
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
         """All persons in a frame, dressed. Raises `RefuError`."""
-        return self._cache.get(index, self._dress)
+        return self._dressed(index)[0]
 
     def facts(self, index: int) -> list[str]:
         """What collision handling reports of a frame, and how long it took."""
-        return self._facts.get(index, [])
+        return self._dressed(index)[1]
 
-    def _dress(self, index: int) -> Sequence[SceneMesh]:
+    def _dress(self, index: int) -> tuple[list[SceneMesh], list[str]]:
         present = [(track, frame) for track in self._tracks if (frame := track.at(self._moments[index])) is not None]
         begun = time.perf_counter()
         outputs = self._pipeline([frame for _, frame in present])
-        took = time.perf_counter() - begun
-        self._facts[index] = [f"dressed in {1e3 * took:.0f} ms", *self._said(outputs)]
-        return [shape for (track, _), output in zip(present, outputs, strict=True) for shape in self._of(track, output)]
-
-    def _said(self, outputs: Sequence[PipelineOutput]) -> list[str]:
-        lines = []
+        facts = [f"dressed in {1e3 * (time.perf_counter() - begun):.0f} ms"]
         for name in self.garments:
             stats = [output.stats.garments[name] for output in outputs]
             inside, left = sum(one.n_inside for one in stats), sum(one.n_unresolved for one in stats)
-            lines.append(f"{name}: {inside} vertices inside, {left} afterwards")
-        return lines if self.sdf != "none" else [f"{name}: as the network says" for name in self.garments]
+            found = f"{inside} vertices inside, {left} afterwards" if self.sdf != "none" else "as the network says"
+            facts.append(f"{name}: {found}")
+        people = zip(present, outputs, strict=True)
+        return [shape for (track, _), output in people for shape in self._of(track, output)], facts
 
-    def _of(self, track: PersonMotion, output: PipelineOutput) -> list[SceneMesh]:
-        shift = track.turn @ output.transl - self._origin
-        turn = track.turn.astype(np.float32)
-
-        def placed(vertices: NDArray[np.float32]) -> NDArray[np.float32]:
-            there: NDArray[np.float32] = vertices @ turn.T + shift.astype(np.float32)
-            return there
-
-        shapes = [
-            SceneMesh(BODY, track.person, placed(output.body), self._body_faces, SKIN_COLOUR),
-            SceneMesh(SKIN, track.person, placed(output.skin), self._body_faces, SKIN_COLOUR),
-        ]
+    def _of(self, track: PersonMotion, output: PipelineOutput) -> Iterator[SceneMesh]:
+        shift, turn = (track.turn @ output.transl - self._origin).astype(np.float32), track.turn.astype(np.float32)
+        for name, vertices in ((BODY, output.body), (SKIN, output.skin)):
+            yield SceneMesh(name, track.person, vertices @ turn.T + shift, self._body_faces, SKIN_COLOUR)
         for name, mesh in output.items():
             color = self._pipeline.garments[name].card.color
-            shapes.append(SceneMesh(name, track.person, placed(mesh.local), mesh.faces, color))
-        return shapes
+            yield SceneMesh(name, track.person, mesh.local @ turn.T + shift, mesh.faces, color)
 
     def _read(self, path: Path, name: str) -> list[PersonMotion]:
         """All persons in a file; their names begin with `name`, which is empty for a single file."""

@@ -1,11 +1,11 @@
-"""What a viewer shows: shapes at times, from any source."""
+"""What a viewer shows: meshes of a moment, from any film."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 BODY, SKIN = "body", "skin"
 """Names of shapes that aren't garments: the collider, and the posed body as it is."""
 _CACHE_BYTES = 512 << 20
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,51 +37,6 @@ class SceneMesh:
         return self.name not in (BODY, SKIN)
 
 
-class Film(Protocol):
-    """Frames that can be asked for in any order, from one thread."""
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Time of each frame, from the first one on [s], shape (T,), T > 0."""
-
-    @property
-    def title(self) -> str:
-        """What is shown, as a title for the user."""
-
-    @property
-    def front(self) -> float:
-        """Where the first person faces at the beginning: the angle from x towards y [rad]."""
-
-    def shapes(self, index: int) -> Sequence[SceneMesh]:
-        """Everything in a frame; a person who isn't there has no shapes. Raises `RefuError`."""
-
-    def facts(self, index: int) -> list[str]:
-        """Facts about a frame, one a line."""
-
-
-class Cache:
-    """Keeps the shapes of the frames used last, up to half a gigabyte of vertices."""
-
-    def __init__(self) -> None:
-        self._shapes: OrderedDict[int, Sequence[SceneMesh]] = OrderedDict()
-        self._bytes = 0
-
-    def get(self, index: int, make: Callable[[int], Sequence[SceneMesh]]) -> Sequence[SceneMesh]:
-        """The shapes of a frame, made if they aren't kept."""
-        found = self._shapes.get(index)
-        if found is None:
-            found = self._shapes[index] = make(index)
-            self._bytes += _size(found)
-            while self._bytes > _CACHE_BYTES and len(self._shapes) > 1:
-                self._bytes -= _size(self._shapes.popitem(last=False)[1])
-        self._shapes.move_to_end(index)
-        return found
-
-    def clear(self) -> None:
-        """Forgets all shapes."""
-        self._shapes.clear()
-        self._bytes = 0
-
-
-def _size(shapes: Sequence[SceneMesh]) -> int:
-    return sum(shape.vertices.nbytes for shape in shapes)
+def remembering(make: Callable[[int], Made], *, frame_bytes: int) -> Callable[[int], Made]:
+    """`make`, which keeps what it made of the frames used last: half a gigabyte of frames of such a size."""
+    return lru_cache(max(1, _CACHE_BYTES // max(1, frame_bytes)))(make)

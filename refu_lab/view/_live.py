@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import msg_adapters as adapters
 from refu_core import RefuError
 from refu_lab.view._film import SceneMesh
-from refu_lab.view._markers import MarkerScene
+from refu_lab.view._recorded import MarkerScene
 
 TOPICS = ("garments", "body")
 _LOOK_S = 0.2
@@ -50,14 +50,12 @@ class LiveFilm:
     def wait(self, until: Callable[[], bool]) -> bool:
         """Waits for the first meshes, of all topics if they come soon; returns whether any came before `until` held."""
         with self._changed:
-            while not self._is_here() and not until():
+            while not until():
+                here, is_late = self._scene.topics, time.monotonic() > (self._since or np.inf) + _TOGETHER_S
+                if here and (is_late or here == self._heard):  # the ground is put under all feet
+                    break
                 self._changed.wait(_LOOK_S)
             return bool(self._scene.topics)
-
-    def _is_here(self) -> bool:
-        """Whether there is enough to show: the ground is put under the first shapes, so feet are waited for."""
-        is_late = self._since is not None and time.monotonic() > self._since + _TOGETHER_S
-        return bool(self._scene.topics) and (is_late or self._scene.topics == self._heard)
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:  # noqa: ARG002
         """What each topic published last, without meshes that are gone."""

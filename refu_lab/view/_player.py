@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
     import viser
 
-    from refu_lab.view._film import Film, SceneMesh
+    from refu_lab.view._film import SceneMesh
+    from refu_lab.view._recorded import RecordedFilm
 
 _SPEEDS = {"¼ ×": 0.25, "½ ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
 _HIDDEN = "hidden"
@@ -36,7 +37,7 @@ _IDLE_S = 0.5
 class Player:
     """One film on one server. The thread in `run` does what the panel's callbacks ask for."""
 
-    def __init__(self, server: viser.ViserServer, film: Film) -> None:
+    def __init__(self, server: viser.ViserServer, film: DressedFilm | RecordedFilm | LiveFilm) -> None:
         self._server, self._film = server, film
         self._stage, self._finder = Stage(server), BandFinder()
         self._times = film.times
@@ -184,9 +185,6 @@ class Player:
             sdf = film.sdf if isinstance(film, DressedFilm) else modes[0]
             self._sdf = gui.add_dropdown("distance", modes, initial_value=sdf, visible=is_dressed)
         self._said = gui.add_markdown("")
-        self._connect()
-
-    def _connect(self) -> None:
         inputs = (self._speed, self._follows, self._body, self._marking, self._wire, self._sdf, *self._boxes.values())
         for one in inputs:
             one.on_update(self._ask)
@@ -217,13 +215,8 @@ def _legend() -> str:
     lines, below = [], 0.0
     for limit, color in CLEARANCE:
         shade = "#" + "".join(f"{round(255 * channel):02x}" for channel in color)
-        what = (
-            "inside"
-            if limit == 0
-            else f"{1e3 * below:g}–{1e3 * limit:g} mm"
-            if limit < np.inf
-            else f"> {1e3 * below:g} mm"
-        )
+        what = f"{1e3 * below:g}–{1e3 * limit:g} mm" if limit < np.inf else f"> {1e3 * below:g} mm"
+        what = what if limit > 0 else "inside"
         lines.append(f'<span style="color:{shade}">■</span> {what}')
         below = limit
     return "  \n".join(lines)

@@ -95,8 +95,8 @@ class Stage:
         shift = np.array([centre[0], centre[1], 0.0])
         camera = self._server.initial_camera
         camera.fov = math.radians(_FOV)
-        camera.position = vertices_ros_from_smpl(np.array(framed.eye)) - shift
-        camera.look_at = vertices_ros_from_smpl(np.array(framed.target)) - shift
+        camera.position = vertices_ros_from_smpl(framed.eye) - shift
+        camera.look_at = vertices_ros_from_smpl(framed.target) - shift
         camera.near = 0.02
 
     def follow(self, shapes: Sequence[SceneMesh]) -> None:

@@ -79,7 +79,8 @@ def _play(
     url = f"http://{host}:{server.get_port()}"
     what = "" if isinstance(film, LiveFilm) else f": {len(film.times)} frames"
     say(f"{film.title}{what} at {url} (Ctrl-C ends it)")
-    if options.browser and _has_display():
+    has_display = sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if options.browser and has_display:  # without one, some browsers open in the terminal
         webbrowser.open(url)
     player.run(until=until)
 
@@ -132,8 +133,3 @@ def _is_free(host: str, port: int) -> bool:
     except OSError:
         return False
     return True
-
-
-def _has_display() -> bool:
-    """Whether a browser would open on a screen: without one, some open in the terminal."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

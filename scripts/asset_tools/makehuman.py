@@ -168,26 +168,17 @@ def _smpl_joint(bone: str) -> str:
     stem, _, suffix = bone.partition(".")
     side = {"L": "left_", "R": "right_"}.get(suffix[-1:], "")
     by_stem = {
-        "root": "pelvis",
-        "pelvis": "pelvis",
-        "spine05": "pelvis",
-        "spine04": "pelvis",
+        **dict.fromkeys(("root", "pelvis", "spine05", "spine04"), "pelvis"),
         "spine03": "spine1",
-        "spine02": "spine2",
-        "breast": "spine2",
+        **dict.fromkeys(("spine02", "breast"), "spine2"),
         "spine01": "spine3",
-        "neck01": "neck",
-        "neck02": "neck",
-        "neck03": "neck",
+        **dict.fromkeys(("neck01", "neck02", "neck03"), "neck"),
     }
     by_prefix = {
-        "clavicle": "collar",
-        "shoulder01": "collar",
+        **dict.fromkeys(("clavicle", "shoulder01"), "collar"),
         "upperarm": "shoulder",
         "lowerarm": "elbow",
-        "wrist": "wrist",
-        "metacarpal": "wrist",
-        "finger1": "wrist",  # SMPL's hand joint bends the four fingers, not the thumb
+        **dict.fromkeys(("wrist", "metacarpal", "finger1"), "wrist"),  # SMPL's hand joint doesn't bend the thumb
         "finger": "hand",
         "upperleg": "hip",
         "lowerleg": "knee",

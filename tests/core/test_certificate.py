@@ -11,8 +11,7 @@ from refu_core import GarmentPipeline, SmplFrame
 from refu_core.body import JOINT_NAMES
 from refu_core.realtime import PROMISED_POSES, within_promise
 from refu_core.sdf import Winding
-from refu_lab.stress import everyday, promised
-from refu_lab.stress._frames import FRAMES
+from refu_lab.stress._frames import FRAMES, everyday, promised
 
 
 def _n_inside(points: np.ndarray, body: np.ndarray, faces: torch.Tensor) -> int:

@@ -14,18 +14,10 @@ from refu_core import FrameError, SmplFrame
 from refu_core.errors import MeshError
 from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
 from refu_core.modes import DEFAULT_MARGIN
-from refu_lab.stress import (
-    CHECKS,
-    FRAMES,
-    Check,
-    Subject,
-    Trial,
-    Wardrobe,
-    distance_to_mesh,
-    load_trial,
-    mirror_image,
-    replay_trial,
-)
+from refu_lab.stress._frames import FRAMES
+from refu_lab.stress._invariance import mirror_image
+from refu_lab.stress._rounds import CHECKS, replay_trial
+from refu_lab.stress._trial import Check, Subject, Trial, Wardrobe, distance_to_mesh, load_trial
 
 WORST = sorted((Path(__file__).parents[1] / "data" / "stress").glob("*.npz"))
 WARDROBES = {

@@ -21,7 +21,7 @@ import torch
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core.realtime import Dressed, PipelineOutput
 from refu_core.realtime._frame import FrameStep
-from refu_lab.stress import everyday
+from refu_lab.stress._frames import everyday
 
 _GARMENTS = ("tshirt-male", "short-pant-male")
 

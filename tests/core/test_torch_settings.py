@@ -13,7 +13,7 @@ import trimesh
 from refu_core import ExactSdf, GarmentPipeline, Resolver, SmplFrame
 from refu_core.realtime import PipelineOutput
 from refu_core.sdf import BandSdf
-from refu_lab.stress import everyday
+from refu_lab.stress._frames import everyday
 
 Settings = Callable[[], contextlib.AbstractContextManager[object]]
 

@@ -13,18 +13,9 @@ import pytest
 import torch
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
-from refu_lab.benchmark import (
-    PLAIN_QUERY,
-    BenchmarkResult,
-    PaperSettings,
-    PaperStructure,
-    Timing,
-    measure,
-    one_core,
-    processor_clock,
-    sdf_methods,
-)
-from refu_lab.benchmark._inputs import read_stretches, sdf_frame
+from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, Timing, measure, one_core, processor_clock
+from refu_lab.benchmark._paper import PaperSettings, PaperStructure
+from refu_lab.benchmark._sdfs import PLAIN_QUERY, read_stretches, sdf_frame, sdf_methods
 from refu_lab.benchmark._sections import GRAPH, LAUNCHES, Section, frame_runners
 from refu_lab.cli import main
 from refu_lab.commands.benchmark import BenchmarkOptions
@@ -170,9 +161,10 @@ def test_contenders_take_turns_and_jumps_are_not_counted() -> None:
 def test_a_timing_compares_by_the_processor_or_on_a_gpu_by_the_wall() -> None:
     cpu, wall = np.array([1.0, 2.0, 4.0]), np.array([10.0, 20.0, 40.0])
     assert Timing(cpu, wall).median == 2.0
-    assert Timing(cpu, wall).quartiles == (1.5, 3.0)
+    row = BenchmarkRow.of(Timing(cpu, wall), Timing(cpu, cpu), stage="sdf", mode="plain", garment=SHORTS)
+    assert (row.ms_q1, row.ms_median, row.ms_q3) == (1.5, 2.0, 3.0)
+    assert (row.wall_ms_median, row.ratio, row.samples) == (20.0, 1.0, 3)
     assert Timing(cpu, wall, on_gpu=True).median == 20.0
-    assert Timing(cpu, wall).wall_median == 20.0
 
 
 def test_clock_and_core_are_given_back() -> None:

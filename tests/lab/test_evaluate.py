@@ -15,7 +15,9 @@ import torch
 
 from refu_core import GarmentPipeline, PipelineOutput, RefuError, SmplFrame, load_body, load_garment
 from refu_lab.cli import main
-from refu_lab.reproduction import Library, OutfitJudge, SampleSet, Study, _motion, _plots, _runs, run_methods
+from refu_lab.reproduction import OutfitJudge, _motion, _plots, _runs
+from refu_lab.reproduction._methods import Library
+from refu_lab.reproduction._runs import SampleSet, Study, run_methods
 from refu_lab.truth import moments_of
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -124,12 +126,12 @@ def test_figures_are_the_same_whoever_runs_the_samples(dataset: Path, monkeypatc
         run_methods(study, samples, ["skinned-naive", "node-skinned"], library=Library(), engine=engine)
         found.append(
             {
-                name: ([asdict(one) for one in run.samples], run.unseen, sorted(run.ms), run.scales.count.tolist())
+                name: [(asdict(one.figures), one.unseen, sorted(one.ms), one.scales.tolist()) for one in run.samples]
                 for name, run in study.runs.items()
             }
         )
     assert found[0] == found[1]
-    assert all(len(samples) == 2 for samples, *_ in found[0].values())
+    assert all(len(samples) == 2 for samples in found[0].values())
 
 
 def test_motion_of_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,8 @@ from msg_adapters import BagReader
 from refu_core import RefuError, SmplFrame
 from refu_core._engine import InProcess, Lost
 from refu_lab.cli import main
-from refu_lab.fleet import FleetError, find_recordings, fleet_table, is_plain, open_engine
-from refu_lab.fleet._engine import DaskEngine, run_function
+from refu_lab.fleet import find_recordings, fleet_table, is_plain, open_engine
+from refu_lab.fleet._engine import DaskEngine, FleetError, run_function
 from refu_lab.fleet._summary import FleetResult
 from refu_lab.fleet.replay import _CODE
 from tests.lab import fleet_tasks
@@ -362,7 +362,7 @@ def test_killed_workers_lose_and_double_nothing(
 def test_ctrl_c_ends_the_processes_in_silence() -> None:
     pytest.importorskip("distributed")
     code = (
-        "import time; from refu_lab.fleet import open_engine, run_function\n"
+        "import time; from refu_lab.fleet._engine import open_engine, run_function\n"
         "with open_engine(2) as engine:\n"
         "    try:\n"
         "        for _ in engine.run(run_function(time.sleep), [600.0, 0.0, 0.0]): print('up', flush=True)\n"

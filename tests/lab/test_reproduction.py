@@ -27,8 +27,7 @@ from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, SkinBelow, load_
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import Wearable
 from refu_core.refu import SCALE_PRESETS, Refu
-from refu_lab import reproduction as rp
-from refu_lab.reproduction import _build, _plots, _runs, _tables
+from refu_lab.reproduction import _build, _methods, _motion, _plots, _runs, _sdf, _tables
 from refu_lab.tables import RESULT_TABLES
 
 GARMENT = "short-pant-male"
@@ -43,32 +42,34 @@ N_SAMPLES = 3
 @pytest.mark.parametrize("metric", ["mpve_mm", "vfcp_percent", "cfmp_percent"])
 def test_the_papers_means_follow_from_its_garments(metric: str) -> None:
     """Guards the transcription: the paper's "All Garments" are means weighted by its test counts."""
-    methods = {key[2] for key in rp.PAPER if key[0] == "comparison"}
+    methods = {key[2] for key in _tables.PAPER if key[0] == "comparison"}
     assert len(methods) == 10
     for method in methods:
         total = 0.0
         for garment, count in TEST_COUNTS.items():
-            total += rp.PAPER["comparison", garment, method, metric] * count / sum(TEST_COUNTS.values())
-        assert rp.PAPER["comparison", "all", method, metric] == pytest.approx(total, abs=0.02), method
+            total += _tables.PAPER["comparison", garment, method, metric] * count / sum(TEST_COUNTS.values())
+        assert _tables.PAPER["comparison", "all", method, metric] == pytest.approx(total, abs=0.02), method
 
 
 def test_the_papers_trend_is_computed_anew() -> None:
-    assert rp.paper_figure("comparison", "all", "refu-hybrid", "vfcp_percent_trend") == pytest.approx(-60)
-    assert rp.paper_figure("comparison", "all", "refu-hybrid", "cfmp_percent_trend") == pytest.approx(39.97, abs=0.01)
-    assert rp.paper_figure("comparison", "all", "node-hybrid", "cfmp_percent_trend") is None
-    assert rp.paper_figure("gcnn", "skirt-female", "gcnn", "mpve_mm") == 14.05  # garment not named by the paper
-    assert rp.paper_figure("laplacian", "tshirt-male", "refu-hybrid", "laplacian_mm") is None
+    assert _tables.paper_figure("comparison", "all", "refu-hybrid", "vfcp_percent_trend") == pytest.approx(-60)
+    assert _tables.paper_figure("comparison", "all", "refu-hybrid", "cfmp_percent_trend") == pytest.approx(
+        39.97, abs=0.01
+    )
+    assert _tables.paper_figure("comparison", "all", "node-hybrid", "cfmp_percent_trend") is None
+    assert _tables.paper_figure("gcnn", "skirt-female", "gcnn", "mpve_mm") == 14.05  # garment not named by the paper
+    assert _tables.paper_figure("laplacian", "tshirt-male", "refu-hybrid", "laplacian_mm") is None
 
 
 def test_every_figure_of_the_paper_stands_beside_a_method_of_ours() -> None:
-    built = {name: set(spec.methods) for name, spec in rp.SAMPLE_TABLES.items()}
-    assert set().union(*built.values(), rp.TIMED_METHODS) <= set(rp.METHODS)
+    built = {name: set(spec.methods) for name, spec in _build.SAMPLE_TABLES.items()}
+    assert set().union(*built.values(), _build.TIMED_METHODS) <= set(_methods.METHODS)
     built["time"] = set(_build._COMPONENTS)
     built["sdf"] = {"neural"}
-    for table, _, method, metric in rp.PAPER:
+    for table, _, method, metric in _tables.PAPER:
         assert method in built[table], (table, method)
         assert metric in _tables.METRICS
-    assert set(rp.SAMPLE_TABLES) | {"time", "sdf", "postures", "motion"} == set(RESULT_TABLES)
+    assert set(_build.SAMPLE_TABLES) | {"time", "sdf", "postures", "motion"} == set(RESULT_TABLES)
 
 
 # ---- emulated networks -----------------------------------------------------------------------------------------------
@@ -93,14 +94,14 @@ class Noisy(WithoutWearerCode):
         return self.amplitude * wave[None, :, None] * torch.tensor([1.0, 0.0, 1.0])
 
 
-class Emulated(rp.Library):
+class Emulated(_methods.Library):
     """Weights of the T-shirt's place that were never trained; some are missing."""
 
     def __init__(self, *, without: tuple[str, ...] = ()) -> None:
         super().__init__()
         self.without = without
 
-    def load(self, method: rp.Method, garment: str) -> Wearable:
+    def load(self, method: _methods.Method, garment: str) -> Wearable:
         if method.name in self.without:
             msg = "not trained"
             raise WeightsError(msg)
@@ -114,7 +115,7 @@ class Emulated(rp.Library):
 
 
 @pytest.fixture(scope="module")
-def samples() -> rp.SampleSet:
+def samples() -> _runs.SampleSet:
     """Bodies that sit and lean, in garments that are the skinned template, moved a little."""
     garment, body = load_garment(GARMENT), load_body("male")
     rng = np.random.default_rng(3)
@@ -126,8 +127,8 @@ def samples() -> rp.SampleSet:
         posed = body(pose[None], betas[None])
         rest = garment.rest(torch.from_numpy(betas)[None], torch.from_numpy(style)[None])
         truth = garment.pose(rest + 0.003, posed.transforms)[0].numpy()
-        made.append(rp.Sample(truth, pose, betas, style, 1.0 + k))
-    return rp.SampleSet(GARMENT, N_SAMPLES, None, made.__getitem__)
+        made.append(_runs.Sample(truth, pose, betas, style, 1.0 + k))
+    return _runs.SampleSet(GARMENT, N_SAMPLES, None, made.__getitem__)
 
 
 METHODS = (
@@ -141,9 +142,9 @@ METHODS = (
 
 
 @pytest.fixture(scope="module")
-def study(samples: rp.SampleSet) -> rp.Study:
-    study = rp.Study()
-    rp.run_methods(
+def study(samples: _runs.SampleSet) -> _runs.Study:
+    study = _runs.Study()
+    _runs.run_methods(
         study, samples, (*METHODS, "collision-loss-approx"), library=Emulated(without=("collision-loss-approx",))
     )
     return study
@@ -161,7 +162,9 @@ def fcl_pairs(garment: NDArray[Any], faces: NDArray[Any], body: NDArray[Any], bo
     return int(fcl.collide(model(garment, faces), model(body, body_faces), request, fcl.CollisionResult()))
 
 
-def test_figures_of_the_baseline_against_a_loop_of_other_libraries(study: rp.Study, samples: rp.SampleSet) -> None:
+def test_figures_of_the_baseline_against_a_loop_of_other_libraries(
+    study: _runs.Study, samples: _runs.SampleSet
+) -> None:
     """MPVE, VFCP and CFMP of the emulated backbone, from its definition, libigl and fcl alone."""
     garment, body = load_garment(GARMENT), load_body("male")
     backbone, collider = Noisy(garment, 0.006), Collider(body)
@@ -187,22 +190,22 @@ def test_figures_of_the_baseline_against_a_loop_of_other_libraries(study: rp.Stu
     assert figures.vfcp_percent > 0
 
 
-def test_methods_do_what_their_names_say(study: rp.Study) -> None:
+def test_methods_do_what_their_names_say(study: _runs.Study) -> None:
     figures = {method: study.runs[GARMENT, method].figures for method in METHODS}
     for method in ("naive-accurate", "refu-accurate", "optimisation-accurate"):
         assert figures[method].vfcp_percent < 0.2 * figures["tailornet"].vfcp_percent, method
     # α >= 1 and a margin: no vertex stays inside, and no edge cuts a corner that ε = 0 leaves.
     assert figures["refu-accurate"].vfcp_percent == 0
     assert figures["refu-accurate"].avg_ee < figures["fixed-accurate-bare"].avg_ee
-    assert set(study.runs[GARMENT, "refu-hybrid"].ms) == {"backbone", "sdf", "refu"}
+    assert set(study.runs[GARMENT, "refu-hybrid"].samples[0].ms) == {"backbone", "sdf", "refu"}
     assert study.runs[GARMENT, "optimisation-accurate"].median_ms("post-process") > 0
     assert study.runs[GARMENT, "tailornet"].median_ms("refu") is None
     # Only vertices that the backbone left inside are in the Laplacian error.
     assert figures["tailornet"].laplacian_mm is not None
 
 
-def test_what_is_not_trained_says_so_in_its_row(study: rp.Study, tmp_path: Path) -> None:
-    table = rp.sample_table(study, "comparison")
+def test_what_is_not_trained_says_so_in_its_row(study: _runs.Study, tmp_path: Path) -> None:
+    table = _build.sample_table(study, "comparison")
     assert table.value(GARMENT, "collision-loss-approx", "mpve_mm") is None
     assert table.value(GARMENT, "refu-hybrid", "vfcp_percent") is not None
     page = "\n".join(table.markdown(source=""))
@@ -217,41 +220,43 @@ def test_what_is_not_trained_says_so_in_its_row(study: rp.Study, tmp_path: Path)
     assert path.read_text(encoding="utf-8").startswith("# Comparison")
     rows = json.loads((tmp_path / "comparison.json").read_text(encoding="utf-8"))["rows"]
     assert {tuple(row) for row in rows} == {("table", "garment", "method", "metric", "value", "paper")}
-    again = rp.read_table(tmp_path, "comparison")
+    again = _tables.read_table(tmp_path, "comparison")
     assert again is not None
     assert (again.rows, again.missing) == (table.rows, table.missing)
-    summary = rp.write_summary(tmp_path).read_text(encoding="utf-8")
+    summary = _tables.write_summary(tmp_path).read_text(encoding="utf-8")
     assert "](comparison.md)" in summary
     assert "not made yet: `refu evaluate --table sdf`" in summary
     assert "| ReFU, accurate | " in summary
     (tmp_path / "comparison.json").write_text("[]", encoding="utf-8")
     with pytest.raises(RefuError, match="not results of refu evaluate"):
-        rp.read_table(tmp_path, "comparison")
+        _tables.read_table(tmp_path, "comparison")
 
 
-def test_all_tables_and_plots_of_a_study(study: rp.Study, tmp_path: Path) -> None:
-    for name in (*rp.SAMPLE_TABLES, "time"):
-        table = rp.time_table(study) if name == "time" else rp.sample_table(study, name)
+def test_all_tables_and_plots_of_a_study(study: _runs.Study, tmp_path: Path) -> None:
+    for name in (*_build.SAMPLE_TABLES, "time"):
+        table = _build.time_table(study) if name == "time" else _build.sample_table(study, name)
         assert table.rows, name
         assert all(row.table == name for row in table.rows)
         table.write(tmp_path, command="refu evaluate", n_samples=study.n_samples)
-        for file, _ in rp.PLOTS[name](study, tmp_path) if name in rp.PLOTS else []:
+        for file, _ in _plots.PLOTS[name](study, tmp_path) if name in _plots.PLOTS else []:
             assert (tmp_path / file).read_bytes().startswith(b"<?xml")
     assert {path.name for path in tmp_path.iterdir()} >= {"energy.svg", "energy_zoom.svg", "scale.svg"}
 
 
-def test_plots_of_the_same_figures_are_the_same_files(study: rp.Study, tmp_path: Path) -> None:
+def test_plots_of_the_same_figures_are_the_same_files(study: _runs.Study, tmp_path: Path) -> None:
     contents = []
     for _ in range(2):
-        rp.PLOTS["energy"](study, tmp_path)
+        _plots.PLOTS["energy"](study, tmp_path)
         contents.append((tmp_path / "energy.svg").read_bytes())
     assert contents[0] == contents[1]
 
 
 @pytest.mark.usefixtures("little_light")
-def test_pictures(study: rp.Study, samples: rp.SampleSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures(
+    study: _runs.Study, samples: _runs.SampleSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(_plots, "_SHOT", (60, 80))
-    ((file, caption),) = rp.picture_garments(study, [samples], tmp_path, library=Emulated())
+    ((file, caption),) = _plots.picture_garments(study, [samples], tmp_path, library=Emulated())
     assert (tmp_path / file).read_bytes().startswith(b"\x89PNG")
     assert "ReFU, hybrid" in caption
 
@@ -275,33 +280,32 @@ def test_weighted_mean_equals_the_mean_over_single_samples(pairs: list[tuple[flo
 def test_scales_by_ratio_equal_a_loop(seed: int) -> None:
     rng = np.random.default_rng(seed)
     accurate, approx, alpha = rng.normal(-0.005, 0.01, 60), rng.normal(-0.005, 0.01, 60), rng.uniform(0, 3, 60)
-    scales = _runs.ScaleByRatio()
     tensors = [torch.from_numpy(a) for a in (alpha, approx, accurate)]
-    scales.add(_runs.MethodOutput(torch.zeros(0, 3), {}, *tensors))
+    count, total = _runs.scales_by_ratio(_runs.MethodOutput(torch.zeros(0, 3), {}, *tensors))
     edges = _runs.RATIO_EDGES
     for k in range(len(edges) - 1):
         members = [
             a for a, f, s in zip(alpha, approx, accurate, strict=True) if f < 0 > s and edges[k] <= f / s < edges[k + 1]
         ]
-        assert scales.count[k] == len(members)
-        assert scales.total[k] == pytest.approx(sum(members))
+        assert count[k] == len(members)
+        assert total[k] == pytest.approx(sum(members))
 
 
-def test_unseen_groups_are_as_large_as_each_other_and_sorted(study: rp.Study) -> None:
+def test_unseen_groups_are_as_large_as_each_other_and_sorted(study: _runs.Study) -> None:
     run = study.runs[GARMENT, "tailornet"]
-    assert [[float(d) for d in distance] for distance, _ in _build.unseen_groups([run])] == [[1.0], [2.0], [3.0]]
-    values = rp.SAMPLE_TABLES["unseen"].of(run)
+    assert [[float(d) for d in distance] for distance, _ in _build.unseen_groups(run)] == [[1.0], [2.0], [3.0]]
+    values = _build.SAMPLE_TABLES["unseen"].of(run)
     assert list(values) == [f"error [mm] at {d:.2f} to {d:.2f}" for d in (1, 2, 3)]
-    assert list(values.values()) == pytest.approx([s.collision_error_mm for s in run.samples])
-    unknown = rp.MethodRun(run.garment, run.method, run.samples, [float("nan")] * N_SAMPLES)
-    assert _build.unseen_groups([unknown]) == []
+    assert list(values.values()) == pytest.approx(run.values("collision_error_mm"))
+    unknown = _runs.MethodRun(run.method, [one._replace(unseen=float("nan")) for one in run.samples])
+    assert _build.unseen_groups(unknown) == []
 
 
 # ---- the other tables ------------------------------------------------------------------------------------------------
 
 
-def test_distance_table(samples: rp.SampleSet) -> None:
-    table = rp.sdf_table([samples], library=rp.Library())
+def test_distance_table(samples: _runs.SampleSet) -> None:
+    table = _sdf.sdf_table([samples], library=_methods.Library())
     assert table.value(GARMENT, "approx", "mean_absolute_mm") < 2
     assert table.value(GARMENT, "approx, within 2 cm", "missed_percent") < 2
     assert table.value(GARMENT, "approx, within 2 cm", "p99_mm") < 1
@@ -313,10 +317,10 @@ def test_distance_table(samples: rp.SampleSet) -> None:
     assert next(row.paper for row in table.rows if row.method == "neural") == 2.46
 
 
-def test_sequence_table_has_both_numbers_of_shapes(samples: rp.SampleSet) -> None:
-    study = rp.Study()
-    rp.run_methods(study, samples, ("mlp-5", "mlp-5-refu-approx"), library=Emulated())
-    table = rp.sample_table(study, "sequence")
+def test_sequence_table_has_both_numbers_of_shapes(samples: _runs.SampleSet) -> None:
+    study = _runs.Study()
+    _runs.run_methods(study, samples, ("mlp-5", "mlp-5-refu-approx"), library=Emulated())
+    table = _build.sample_table(study, "sequence")
     assert [row.paper for row in table.rows if row.metric == "cfmp_percent"] == [18.69, 52.53, 13.30, 38.39]
     assert table.value(GARMENT, "mlp-5", "mpve_mm") == study.runs[GARMENT, "mlp-5"].figures.mpve_mm
     assert {m.method: m.reason for m in table.missing} == dict.fromkeys(
@@ -324,50 +328,49 @@ def test_sequence_table_has_both_numbers_of_shapes(samples: rp.SampleSet) -> Non
     )
 
 
-def test_two_garments_are_weighted_by_their_samples(study: rp.Study) -> None:
-    both = rp.Study(dict(study.runs), dict(study.missing), {GARMENT: N_SAMPLES, "shirt-male": 2 * N_SAMPLES})
+def test_two_garments_are_weighted_by_their_samples(study: _runs.Study) -> None:
+    both = _runs.Study(dict(study.runs), dict(study.missing), {GARMENT: N_SAMPLES, "shirt-male": 2 * N_SAMPLES})
     for method in METHODS:
         run = study.runs[GARMENT, method]
-        both.runs["shirt-male", method] = rp.MethodRun(
-            "shirt-male", method, run.samples[:1] * (2 * N_SAMPLES), [1.0] * 6
-        )
-    table = rp.sample_table(both, "comparison")
+        both.runs["shirt-male", method] = _runs.MethodRun(method, run.samples[:1] * (2 * N_SAMPLES))
+    table = _build.sample_table(both, "comparison")
     for method in METHODS[:5]:
-        every = [s.mpve_mm for g in (GARMENT, "shirt-male") for s in both.runs[g, method].samples]
-        assert table.value(rp.ALL, method, "mpve_mm") == pytest.approx(np.mean(every))
-    assert table.value(rp.ALL, "collision-loss-approx", "mpve_mm") is None
+        every = np.concatenate([both.runs[g, method].values("mpve_mm") for g in (GARMENT, "shirt-male")])
+        assert table.value(_tables.ALL, method, "mpve_mm") == pytest.approx(np.mean(every))
+    assert table.value(_tables.ALL, "collision-loss-approx", "mpve_mm") is None
 
 
-def test_postures_against_a_loop(study: rp.Study) -> None:
+def test_postures_against_a_loop(study: _runs.Study) -> None:
     """In a study whose methods stand for the network and for the node."""
     alone, node = (study.runs[GARMENT, name] for name in ("tailornet", "refu-hybrid"))
     postures = [*("squat", "sitting", None) * N_SAMPLES][:N_SAMPLES]
-    small = rp.Study(n_samples={GARMENT: N_SAMPLES})
+    small = _runs.Study(n_samples={GARMENT: N_SAMPLES})
     for name, run in (("tailornet", alone), ("node-hybrid", node)):
-        small.runs[GARMENT, name] = rp.MethodRun(GARMENT, name, run.samples, postures=postures)
-    table = rp.posture_table(small)
+        held = [one._replace(posture=posture) for one, posture in zip(run.samples, postures, strict=True)]
+        small.runs[GARMENT, name] = _runs.MethodRun(name, held)
+    table = _build.posture_table(small)
     assert {row.method for row in table.rows} == {"squat", "sitting", "all of them"}
-    known = [one for one, name in zip(node.samples, postures, strict=True) if name]
-    whole = np.mean([one.mpve_mm for one in known])
+    errors = node.values("mpve_mm")
+    whole = np.mean([error for error, name in zip(errors, postures, strict=True) if name])
     assert table.value(GARMENT, "all of them", "mpve_mm") == pytest.approx(whole)
     squats = [k for k, name in enumerate(postures) if name == "squat"]
-    error = np.mean([node.samples[k].mpve_mm for k in squats])
+    error = errors[squats].mean()
     assert table.value(GARMENT, "squat", "n_samples") == len(squats)
     assert table.value(GARMENT, "squat", "mpve_mm") == pytest.approx(error)
     assert table.value(GARMENT, "squat", "share_of_mean") == pytest.approx(error / whole)
-    before = np.mean([alone.samples[k].mpve_mm for k in squats])
+    before = alone.values("mpve_mm")[squats].mean()
     assert table.value(GARMENT, "squat", "network_mpve_mm") == pytest.approx(before)
-    free = 100 * np.mean([node.samples[k].is_free for k in squats])
+    free = 100 * node.values("is_free")[squats].mean()
     assert table.value(GARMENT, "squat", "cfmp_percent") == pytest.approx(free)
     assert table.missing == []
 
 
-def test_samples_without_postures_have_no_rows_and_the_page_says_what_makes_some(study: rp.Study) -> None:
+def test_samples_without_postures_have_no_rows_and_the_page_says_what_makes_some(study: _runs.Study) -> None:
     node = study.runs[GARMENT, "refu-hybrid"]
-    small = rp.Study(n_samples={GARMENT: N_SAMPLES})
-    for name in rp.POSTURE_METHODS:
-        small.runs[GARMENT, name] = rp.MethodRun(GARMENT, name, node.samples, postures=[None] * N_SAMPLES)
-    table = rp.posture_table(small)
+    small = _runs.Study(n_samples={GARMENT: N_SAMPLES})
+    for name in _build.POSTURE_METHODS:
+        small.runs[GARMENT, name] = _runs.MethodRun(name, node.samples)
+    table = _build.posture_table(small)
     assert table.rows == []
     assert f"`refu simulate {GARMENT} --postures 1" in "\n".join(table.markdown(source=""))
 
@@ -382,20 +385,20 @@ def walk() -> Motion:
 
 
 @pytest.fixture(scope="module")
-def library() -> rp.Library:
+def library() -> _methods.Library:
     """The weights that ship; a pipeline is loaded once."""
-    library = rp.Library()
+    library = _methods.Library()
     library.pipeline = functools.cache(library.pipeline)  # type: ignore[method-assign]
     return library
 
 
 @pytest.fixture(scope="module")
-def motion_table(walk: Motion, library: rp.Library) -> rp.ResultTable:
+def motion_table(walk: Motion, library: _methods.Library) -> _tables.ResultTable:
     short = Motion(walk.poses[3:6], walk.transl[3:6], walk.betas, walk.fps)
-    return rp.motion_table({"long": walk, "short": short}, library=library, every=4)
+    return _motion.motion_table({"long": walk, "short": short}, library=library, every=4)
 
 
-def test_motion_table_weighs_clips_by_their_frames(motion_table: rp.ResultTable) -> None:
+def test_motion_table_weighs_clips_by_their_frames(motion_table: _tables.ResultTable) -> None:
     assert not motion_table.missing  # the weights of what it shows ship
     groups = list(dict.fromkeys(row.garment for row in motion_table.rows))
     names = (*PAPER_GARMENTS, "male body", "female body")
@@ -409,14 +412,16 @@ def test_motion_table_weighs_clips_by_their_frames(motion_table: rp.ResultTable)
 
 
 @pytest.mark.parametrize("garments", [DEFAULT_GARMENTS, ("skirt-female",)])
-def test_motion_table_against_a_loop(walk: Motion, motion_table: rp.ResultTable, garments: tuple[str, ...]) -> None:
+def test_motion_table_against_a_loop(
+    walk: Motion, motion_table: _tables.ResultTable, garments: tuple[str, ...]
+) -> None:
     """Frames 0 and 4 of nine, each with the one after it."""
     pipeline = GarmentPipeline.load(garments)
     skinned = GarmentPipeline.load(garments, backbone="skinned", sdf="none")
     body = pipeline.body.faces.numpy()
     ways = []
     found: dict[str, dict[str, list[float]]] = {name: {} for name in garments}
-    for index, betas in zip((0, 4), rp.drawn_shapes(3), strict=False):
+    for index, betas in zip((0, 4), _motion.drawn_shapes(3), strict=False):
         shape = np.zeros(10, np.float32) if betas is None else betas
         told = [replace(f, betas=shape) for f in PoseHistory.told(walk.frame(i) for i in range(index + 2))[-2:]]
         now, then, start, end = (p(frame) for p in (pipeline, skinned) for frame in told)
@@ -458,7 +463,7 @@ def test_motion_table_against_a_loop(walk: Motion, motion_table: rp.ResultTable,
 
 
 def test_every_other_person_has_a_shape_of_their_own() -> None:
-    shapes = rp.drawn_shapes(2000)
+    shapes = _motion.drawn_shapes(2000)
     assert all(betas is None for betas in shapes[::2])
     drawn = np.stack([betas for betas in shapes[1::2] if betas is not None])
     assert len(np.unique(drawn, axis=0)) == 1000
@@ -467,23 +472,23 @@ def test_every_other_person_has_a_shape_of_their_own() -> None:
     assert np.abs(drawn.mean(0)).max() < 0.15
 
 
-def test_motion_of_one_frame_has_no_pair(walk: Motion, library: rp.Library) -> None:
+def test_motion_of_one_frame_has_no_pair(walk: Motion, library: _methods.Library) -> None:
     one = Motion(walk.poses[:1], walk.transl[:1], walk.betas, walk.fps)
-    assert rp.motion_table({"still": one}, library=library, every=1).rows == []
+    assert _motion.motion_table({"still": one}, library=library, every=1).rows == []
 
 
 def test_shipped_weights_are_found_by_name(tmp_path: Path) -> None:
-    library = rp.Library([tmp_path])
+    library = _methods.Library([tmp_path])
     with pytest.raises(WeightsError, match="not trained"):
-        library.find(rp.METHODS["alt1-approx"], "tshirt-male")
+        library.find("alt1/tailornet-approx", "tshirt-male")
     (tmp_path / "tshirt-male" / "alt1").mkdir(parents=True)
     (tmp_path / "tshirt-male" / "alt1" / "tailornet-approx.json").write_text("{}", encoding="utf-8")
     assert (
-        library.find(rp.METHODS["alt1-approx"], "tshirt-male") == tmp_path / "tshirt-male" / "alt1" / "tailornet-approx"
+        library.find("alt1/tailornet-approx", "tshirt-male") == tmp_path / "tshirt-male" / "alt1" / "tailornet-approx"
     )
 
 
 def test_the_node_without_networks_has_none() -> None:
-    (wearable,) = rp.Library().pipeline(rp.METHODS["node-skinned"], "tshirt-male").outfit.wearables.values()
+    (wearable,) = _methods.Library().pipeline(_methods.METHODS["node-skinned"], "tshirt-male").outfit.wearables.values()
     assert isinstance(wearable.backbone, Skinned)
     assert wearable.refu is None

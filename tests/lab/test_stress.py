@@ -16,23 +16,20 @@ import pytest
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.realtime import GarmentMesh, PipelineOutput
 from refu_lab.cli import main
-from refu_lab.stress import (
-    CHECKS,
+from refu_lab.stress._guarantees import _above
+from refu_lab.stress._rounds import CHECKS, length
+from refu_lab.stress._soak import SoakResult, resident_mb, soak
+from refu_lab.stress._trial import (
     Check,
     Measurement,
-    SoakResult,
     StressError,
     Subject,
     Tally,
     Trial,
     Wardrobe,
-    length,
     load_trial,
-    resident_mb,
     save_trial,
-    soak,
 )
-from refu_lab.stress._guarantees import _above
 
 SHORTS = Wardrobe(garments=("short-pant-male",))
 """The garment of fewest vertices."""
@@ -226,8 +223,8 @@ def test_soaks_judge_memory_at_once_and_latency_of_many_frames(subject: Subject)
     ticked: list[int] = []
     done = soak(subject.pipeline, mode="here", frames=40, persons=2, tick=ticked.append)
     assert (done.frames, done.nan, sum(ticked)) == (40, 0, 40)
-    assert all(len(tenths) == 10 for tenths in (done.tenths_mb, done.tenths_ms, done.tenths_yardstick_ms))
-    assert all(0 < mb < 1e5 for mb in done.tenths_mb)
+    assert [len(tenths) for tenths in done.tenths.values()] == [10] * 4
+    assert all(0 < mb < 1e5 for mb in done.tenths["mb"])
     with pytest.raises(StressError, match="10 frames or more of each person, got 9"):
         soak(subject.pipeline, mode="here", frames=18, persons=2)
 
@@ -253,10 +250,12 @@ def test_a_soak_fails_by_memory_or_by_latency(
         persons=2,
         nan=0,
         seconds=1.0,
-        tenths_mb=(100, *others, memory),
-        tenths_ms=(1.0, *others, ours),
-        tenths_wall_ms=(1.0, *others, 9.0),
-        tenths_yardstick_ms=(1.0, *others, yardstick),
+        tenths={
+            "mb": (100, *others, memory),
+            "ms": (1.0, *others, ours),
+            "wall_ms": (1.0, *others, 9.0),
+            "yardstick_ms": (1.0, *others, yardstick),
+        },
     )
     assert result.failures == failures
 

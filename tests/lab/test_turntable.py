@@ -11,7 +11,8 @@ import pytest
 import trimesh
 
 from refu_core import RefuError
-from refu_lab.turntable import STYLE, Frame, Mesh, MeshInFrame, turntable
+from refu_lab.render import RenderMesh
+from refu_lab.turntable import STYLE, Frame, turntable
 
 RED, BLUE = (0.9, 0.15, 0.1), (0.1, 0.2, 0.9)
 
@@ -20,13 +21,13 @@ def page(folder: Path) -> Path:
     """A red ball within half a blue one, on its left (+x); afterwards the blue one is on the right, and wider."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
     half = ball.faces[ball.triangles_center[:, 0] > 0]
-    meshes = [Mesh("body", ball.faces, RED), Mesh("half", half, BLUE)]
+    colours = {"body": RED, "half": BLUE}
     inner = np.float32(ball.vertices)
-    before = [MeshInFrame(inner), MeshInFrame(1.2 * inner)]
-    after = [MeshInFrame(inner), MeshInFrame(np.float32([-1.5, 1.5, 1.5]) * inner, np.arange(len(inner)) < 0)]
+    before = [RenderMesh(inner, ball.faces), RenderMesh(1.2 * inner, half)]
+    after = [RenderMesh(inner, ball.faces), RenderMesh(np.float32([-1.5, 1.5, 1.5]) * inner, half)]
     frames = [Frame("one", "<One>", before, after, "was <b>", "is", 0.0)]
     path = folder / "page.html"
-    path.write_text(f"<!doctype html><style>{STYLE}</style>{turntable(meshes, frames)}", encoding="utf-8")
+    path.write_text(f"<!doctype html><style>{STYLE}</style>{turntable(colours, frames)}", encoding="utf-8")
     return path
 
 
@@ -66,7 +67,7 @@ def test_a_page_without_network_draws_turns_and_switches(chromium: browser.Brows
 
 
 def test_too_many_vertices_are_refused() -> None:
-    many = MeshInFrame(np.zeros((40_000, 3), np.float32))
+    many = RenderMesh(np.zeros((40_000, 3), np.float32), np.array([[0, 1, 2]]))
     frame = Frame("one", "One", [many], [many], "", "", 0.0)
     with pytest.raises(RefuError, match="40000 vertices"):
-        turntable([Mesh("body", np.array([[0, 1, 2]]), RED)], [frame])
+        turntable({"body": RED}, [frame])

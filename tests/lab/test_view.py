@@ -31,11 +31,10 @@ from refu_lab.commands.replay import RecordingOptions
 from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, PersonMotion
-from refu_lab.view._film import BODY, SKIN, Cache, SceneMesh
-from refu_lab.view._markers import MarkerScene, Topology, is_drawable
+from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
 from refu_lab.view._marks import CLEARANCE, BandFinder, Marking
 from refu_lab.view._player import Player
-from refu_lab.view._recorded import RecordedFilm
+from refu_lab.view._recorded import MarkerScene, RecordedFilm, Topology, is_drawable
 from refu_lab.view._view import open_film
 
 ROOT = Path(__file__).parents[2]
@@ -237,16 +236,12 @@ def test_the_nearest_frame_of_a_person_is_shown_if_it_is_near(stamps: list[int],
         assert abs(found.stamp_ns / 1e9 - at / 1000) == pytest.approx(gaps.min(), abs=1e-6)
 
 
-def test_the_cache_forgets_what_was_shown_longest_ago(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_shown_longest_ago_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("refu_lab.view._film._CACHE_BYTES", 3 * 120)
-    cache, made = Cache(), []
-
-    def make(index: int) -> list[SceneMesh]:
-        made.append(index)
-        return [SceneMesh(BODY, "", np.zeros((10, 3), np.float32), np.zeros((1, 3), np.int64), (0, 0, 0))]
-
+    made: list[int] = []
+    made_of = remembering(made.append, frame_bytes=120)
     for index in (0, 1, 2, 0, 3, 0, 1):
-        cache.get(index, make)
+        made_of(index)
     assert made == [0, 1, 2, 3, 1]
 
 

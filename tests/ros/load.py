@@ -22,7 +22,7 @@ from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import BagReader, decode_marker_array, decoder_for
-from refu_lab.stress import JUDGED_FROM, TOLERANCE, Yardstick, is_slower, resident_mb, soak_frames
+from refu_lab.stress._soak import JUDGED_FROM, TOLERANCE, Yardstick, is_slower, resident_mb, soak_frames
 from tests.ros.harness import PATIENCE_S, NodeProcess, Peer, start
 
 if TYPE_CHECKING:

@@ -12,8 +12,21 @@ import msg_adapters as adapters
 from refu_core import RefuError
 from refu_core._device import one_thread
 from refu_core._engine import Engine
-from refu_lab import reproduction as rp
 from refu_lab.commands.evaluate import EvaluateOptions
+from refu_lab.reproduction._build import (
+    POSTURE_METHODS,
+    SAMPLE_TABLES,
+    TIMED_METHODS,
+    posture_table,
+    sample_table,
+    time_table,
+)
+from refu_lab.reproduction._methods import SEQUENCE_SHAPES, Library
+from refu_lab.reproduction._motion import motion_table
+from refu_lab.reproduction._plots import PLOTS, picture_garments
+from refu_lab.reproduction._runs import SampleSet, Study, run_methods
+from refu_lab.reproduction._sdf import sdf_table
+from refu_lab.reproduction._tables import ResultTable, is_summary, write_summary
 from refu_lab.tables import RESULT_TABLES
 
 _TIMED = 40
@@ -22,19 +35,15 @@ _TIMED = 40
 
 def _command(options: EvaluateOptions, table: str) -> str:
     """The command that makes a table again, with folder names in place of full paths."""
-    parts = ["refu evaluate", f"--table {table}"]
-    if table == "motion":
-        parts += ["--motions motions/"]
-        parts += [f"--motion-every {options.motion_every}"] if options.motion_every > 1 else []
-    else:
-        parts += [f"--data {' '.join('/'.join(path.resolve().parts[-2:]) for path in options.data)}"]
+    every = f" --motion-every {options.motion_every}" if options.motion_every > 1 else ""
+    data = " ".join("/".join(path.resolve().parts[-2:]) for path in options.data)
+    parts = [f"refu evaluate --table {table}", f"--motions motions/{every}" if table == "motion" else f"--data {data}"]
     parts += [f"--body {Path(options.body).name}"] if options.body is not None else []
     parts += [] if options.collider else ["--no-collider"]
-    parts += [f"--weights {path.resolve().name}" for path in options.weights]
-    return " ".join(parts)
+    return " ".join([*parts, *(f"--weights {path.resolve().name}" for path in options.weights)])
 
 
-def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None = None) -> list[rp.ResultTable]:
+def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None = None) -> list[ResultTable]:
     """Makes and writes the tables that were asked for.
 
     `engine` runs the methods, a block of samples a task; this process alone makes the tables sdf, time and motion.
@@ -48,11 +57,17 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         msg = f"nothing to evaluate: the table {options.table} needs {need}"
         raise RefuError(msg)
     page = options.output / "README.md"
-    if page.exists() and not rp.is_summary(page):
+    if page.exists() and not is_summary(page):
         msg = f"{page}: is there already, and no page of refu evaluate; name another folder with --output"
         raise RefuError(msg)
-    sets = [rp.SampleSet.open(path) for path in options.data]
-    _check_sets(sets)
+    sets = [SampleSet.open(path) for path in options.data]
+    kinds = [(samples.garment, samples.shapes) for samples in sets]
+    if twice := [name for name, n in Counter(kinds).items() if n > 1]:
+        msg = f"wanted one data set a garment, got several of {twice[0][0]}"
+        raise RefuError(msg)
+    if unknown := [shapes for _, shapes in kinds if shapes not in (None, *SEQUENCE_SHAPES)]:
+        msg = f"wanted sequences of {' or '.join(map(str, SEQUENCE_SHAPES))} body shapes, got {unknown[0]}"
+        raise RefuError(msg)
     posed = [samples for samples in sets if samples.shapes is None]
     moving = [samples for samples in sets if samples.shapes is not None]
     has_data = {name: bool(posed) for name in RESULT_TABLES}
@@ -63,61 +78,50 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
         need = "--motions DIR" if options.table == "motion" else f"a data set of {kind} in --data"
         msg = f"the table {options.table} needs {need}"
         raise RefuError(msg)
-    library = rp.Library(options.weights, collider=options.collider, body=options.body)
+    library = Library(options.weights, collider=options.collider, body=options.body)
     how: dict[str, Any] = {"library": library, "progress": progress}
     output, n_posed = options.output, {samples.garment: len(samples) for samples in posed}
     output.mkdir(parents=True, exist_ok=True)
-    study, tables = rp.Study(), []
-    of_study = [name for name in wanted if name in rp.SAMPLE_TABLES and name != "sequence"]
-    methods = list(dict.fromkeys(method for name in of_study for method in rp.SAMPLE_TABLES[name].methods))
-    methods += [name for name in rp.POSTURE_METHODS if "postures" in wanted and name not in methods]
+    study, tables = Study(), []
+    of_study = [name for name in wanted if name in SAMPLE_TABLES and name != "sequence"]
+    methods = list(dict.fromkeys(method for name in of_study for method in SAMPLE_TABLES[name].methods))
+    methods += [name for name in POSTURE_METHODS if "postures" in wanted and name not in methods]
     for samples in posed if methods else ():
-        rp.run_methods(study, samples, methods, engine=engine, **how)
+        run_methods(study, samples, methods, engine=engine, **how)
     for name in wanted:
         n_samples = n_posed
         if name == "sequence":  # one study for all numbers of body shapes, as each has its own methods
-            in_motion = rp.Study()
+            in_motion = Study()
             for samples in moving:
                 own = [f"mlp-{samples.shapes}{refu}" for refu in ("", "-refu-approx")]
-                rp.run_methods(in_motion, samples, own, engine=engine, **how)
-            table = rp.sample_table(in_motion, name)
+                run_methods(in_motion, samples, own, engine=engine, **how)
+            table = sample_table(in_motion, name)
             n_samples = {f"{samples.garment}, {samples.shapes} shapes": len(samples) for samples in moving}
         elif name == "motion":
-            table = rp.motion_table(read_clips(options.motions or Path()), every=options.motion_every, **how)
+            table = motion_table(read_clips(options.motions or Path()), every=options.motion_every, **how)
             n_samples = {}
         elif name == "postures":
-            table = rp.posture_table(study)
+            table = posture_table(study)
         elif name == "sdf":
-            table = rp.sdf_table(posed, **how)
+            table = sdf_table(posed, **how)
         elif name == "time":  # in a run of its own
-            timed = rp.Study()
+            timed = Study()
             with one_thread():
                 for samples in posed:
-                    rp.run_methods(timed, samples.thinned(_TIMED), rp.TIMED_METHODS, **how)
-            table, n_samples = rp.time_table(timed), timed.n_samples
+                    run_methods(timed, samples.thinned(_TIMED), TIMED_METHODS, **how)
+            table, n_samples = time_table(timed), timed.n_samples
         else:
-            table = rp.sample_table(study, name)
-            table.plots += rp.PLOTS[name](study, output) if name in rp.PLOTS else []
+            table = sample_table(study, name)
+            table.plots += PLOTS[name](study, output) if name in PLOTS else []
             if name == "comparison":
-                table.plots += rp.picture_garments(study, posed, output, library=library)
+                table.plots += picture_garments(study, posed, output, library=library)
         table.write(output, command=_command(options, name), n_samples=n_samples)
         tables.append(table)
-    rp.write_summary(output)
+    write_summary(output)
     return tables
 
 
-def _check_sets(sets: Sequence[rp.SampleSet]) -> None:
-    twice = [name for name, n in Counter((samples.garment, samples.shapes) for samples in sets).items() if n > 1]
-    if twice:
-        msg = f"wanted one data set a garment, got several of {twice[0][0]}"
-        raise RefuError(msg)
-    unknown = [samples.shapes for samples in sets if samples.shapes not in (None, *rp.SEQUENCE_SHAPES)]
-    if unknown:
-        msg = f"wanted sequences of {' or '.join(map(str, rp.SEQUENCE_SHAPES))} body shapes, got {unknown[0]}"
-        raise RefuError(msg)
-
-
-def results_text(tables: Sequence[rp.ResultTable], output: Path) -> str:
+def results_text(tables: Sequence[ResultTable], output: Path) -> str:
     """What `refu evaluate` prints: a short form of every table, and where the pages are."""
     parts = []
     for table in tables:
@@ -127,7 +131,7 @@ def results_text(tables: Sequence[rp.ResultTable], output: Path) -> str:
     return "\n\n".join([*parts, f"wrote {output / 'README.md'}"])
 
 
-def results_dict(tables: Sequence[rp.ResultTable]) -> dict[str, Any]:
+def results_dict(tables: Sequence[ResultTable]) -> dict[str, Any]:
     """The machine-readable result (`--json`)."""
     return {
         "rows": [row._asdict() for table in tables for row in table.rows],
@@ -136,11 +140,7 @@ def results_dict(tables: Sequence[rp.ResultTable]) -> dict[str, Any]:
 
 
 def read_clips(folder: Path) -> dict[str, adapters.Motion]:
-    """A folder's AMASS-style motions, by name.
-
-    Raises:
-        RefuError: there is no motion, or one can't be read.
-    """
+    """A folder's AMASS-style motions, by name. Raises `RefuError`: there is no motion, or one can't be read."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
         msg = f"{folder}: no motion in it, wanted AMASS-style .npz files"
