@@ -58,15 +58,13 @@ class Motion(Recording):
         try:
             count = n_resampled(len(self), self.fps, fps)
         except ValueError as error:
-            msg = f"{self.source}: {error}"
-            raise MotionFileError(msg) from error
+            raise MotionFileError(f"{self.source}: {error}") from error
         bad = not_finite(self.poses, self.transl)
         if bad.size:
-            msg = (
+            raise MotionFileError(
                 f"{self.source}: {bad.size} of {len(self)} frames aren't finite (the first: {bad[0]}); cut them out, "
                 f"or leave the rate at its own {self.fps:g} Hz"
             )
-            raise MotionFileError(msg)
         at = np.minimum(np.arange(count) * (self.fps / fps), len(self) - 1)
         poses, transl = interpolated(self.poses, self.transl, np.arange(len(self)), at)
         return replace(self, poses=poses.astype(np.float32), transl=transl, fps=float(fps))
@@ -118,8 +116,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
         raise BagError(msg)
     frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
     if not frames:
-        msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
-        raise BagError(msg)
+        raise BagError(f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why")
     steps = np.diff([frame.stamp_ns for frame in frames])
     longest = max(_PAUSE_NS, 3 * float(np.median(np.abs(steps)))) if len(steps) else 0.0
     kept = steps[np.abs(steps) <= longest]  # small steps back are kept, too: they are no pause

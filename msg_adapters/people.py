@@ -39,16 +39,14 @@ def check_plausible(frame: SmplFrame) -> None:
     ):
         largest = float(np.abs(value).max())
         if largest > limit:
-            msg = f"{name}: wanted magnitudes up to {limit:g}, got {largest:g}"
-            raise FrameError(msg)
+            raise FrameError(f"{name}: wanted magnitudes up to {limit:g}, got {largest:g}")
     check_stamp(frame.stamp_ns)
 
 
 def check_stamp(stamp_ns: int) -> None:
     """Raises `FrameError` for a time [ns] that no message holds, or before the clock's beginning."""
     if not 0 <= stamp_ns < _MAX_STAMP_NS:
-        msg = f"wanted a stamp that fits a ROS time, got {stamp_ns} ns"
-        raise FrameError(msg)
+        raise FrameError(f"wanted a stamp that fits a ROS time, got {stamp_ns} ns")
 
 
 class InputStream:
@@ -100,8 +98,7 @@ class InputStream:
         frames, frame_ids = {}, {}
         people = decode_keypoints(self._input_type, data, n_points)
         if len(people) > MOST_PEOPLE:
-            msg = f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed"
-            raise DecodeError(msg)
+            raise DecodeError(f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed")
         for name, seen in people.items():
             person = "_".join(word for word in (sender, name) if word)
             frame_ids[person] = seen.frame_id

@@ -49,8 +49,7 @@ def quaternion_from_matrix(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     try:
         return Rotation.from_matrix(matrix).as_quat(canonical=True)
     except (ValueError, np.linalg.LinAlgError) as error:
-        msg = f"wanted a rotation, got {matrix.tolist()}"
-        raise EncodeError(msg) from error
+        raise EncodeError(f"wanted a rotation, got {matrix.tolist()}") from error
 
 
 def encode_transforms(transforms: Sequence[Transform]) -> bytes:
@@ -124,13 +123,11 @@ class _Track:
         elif after == len(self.stamps):
             lag = stamp_ns - self.stamps[-1]
             if lag > tolerance_ns:
-                msg = f"the newest transform of {child} is {1e-9 * lag:.3f} s older than the input"
-                raise TransformError(msg)
+                raise TransformError(f"the newest transform of {child} is {1e-9 * lag:.3f} s older than the input")
             value, is_late = self.values[-1], True
         elif after == 0:
             lag = self.stamps[0] - stamp_ns
-            msg = f"the oldest transform of {child} is {1e-9 * lag:.3f} s newer than the input"
-            raise TransformError(msg)
+            raise TransformError(f"the oldest transform of {child} is {1e-9 * lag:.3f} s newer than the input")
         else:
             value = _between(self.values[after - 1 : after + 1], self.stamps[after - 1 : after + 1], stamp_ns)
         return Placement(Rotation.from_quat(value[3:]).as_matrix(), value[:3], is_late)
@@ -234,8 +231,7 @@ class TransformBuffer:
         for way in ways:
             ring = self._ring(way)
             if not {*ring}.isdisjoint((*up, *down)):
-                msg = f"frames form a ring, end who sends one of these: {' in '.join((*ring, ring[0]))}"
-                raise TransformError(msg)
+                raise TransformError(f"frames form a ring, end who sends one of these: {' in '.join((*ring, ring[0]))}")
         if common is None:
             msg = f"no transform leads from {source or 'a frame without a name'} to {target}"
             if not self._tracks:

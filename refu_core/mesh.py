@@ -103,12 +103,11 @@ class Connectivity:
         one_way = np.bincount(self.edge_of_corner.ravel(), weights=np.where(end > start, 1.0, -1.0)) != 0
         n_flipped = int(one_way[n_faces == 2].sum())
         if n_open or n_crowded or n_flipped:
-            msg = (
+            raise MeshError(
                 f"a signed distance needs a watertight body: {n_open} open edges, {n_crowded} edges of more than two "
                 f"faces and {n_flipped} edges whose two faces face opposite ways; close the mesh and orient its faces "
                 "outward"
             )
-            raise MeshError(msg)
 
     @cached_property
     def across(self) -> NDArray[np.int32]:
@@ -142,13 +141,11 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
     """
     array = np.asarray(faces.cpu() if hasattr(faces, "cpu") else faces)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
-        msg = f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}"
-        raise MeshError(msg)
+        raise MeshError(f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}")
     low, high = int(array.min()), int(array.max())
     limit = n_vertices if n_vertices is not None else np.iinfo(np.int32).max
     if low < 0 or high >= limit:
-        msg = f"faces must index vertices 0 to {limit - 1}, got {low} to {high}"
-        raise MeshError(msg)
+        raise MeshError(f"faces must index vertices 0 to {limit - 1}, got {low} to {high}")
     repeated = (array == np.roll(array, 1, axis=1)).any(axis=1)
     if repeated.any():
         msg = f"every face needs three different vertices; {repeated.sum()} of {len(array)} repeat one, "
@@ -185,12 +182,10 @@ def as_points(
         msg = f"{name} must be numbers of the shape ({'N' if n is None else n}, 3), got {type(values).__name__}"
         raise MeshError(msg) from error
     if points.ndim != 2 or points.shape[1] != 3 or (n is not None and len(points) != n):
-        msg = f"{name} must have the shape ({'N' if n is None else n}, 3), got {points.shape}"
-        raise MeshError(msg)
+        raise MeshError(f"{name} must have the shape ({'N' if n is None else n}, 3), got {points.shape}")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points)).any(axis=1).sum())
-        msg = f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates"
-        raise MeshError(msg)
+        raise MeshError(f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates")
     # Torch warns about read-only arrays, and those of a pipeline are.
     return points if points.flags.writeable else points.copy()
 

@@ -52,8 +52,7 @@ class BagJob:
         except ProcessLookupError:  # it has ended already: `_wait` says why
             pass
         except OSError as error:
-            msg = f"no bag can be replayed: {error}"
-            raise RefuError(msg) from error
+            raise RefuError(f"no bag can be replayed: {error}") from error
         pool = ThreadPoolExecutor(1, "bag")
         self.done = pool.submit(self._wait, told)
         """The result of `refu replay --json`, or a `RefuError` with the reason that the command gives."""

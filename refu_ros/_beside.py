@@ -104,8 +104,7 @@ class RequestDresser:
         Raises `RefuError` where too many wait.
         """
         if not self._waiting.acquire(blocking=False):
-            msg = f"{_MOST_WAITING} requests wait already: ask again when one has been answered"
-            raise RefuError(msg)
+            raise RefuError(f"{_MOST_WAITING} requests wait already: ask again when one has been answered")
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, "dresser", initializer=_give_way)
         asked = self._pool.submit(self._dress, frame, settings, then)
@@ -127,8 +126,7 @@ class RequestDresser:
         rotation = ros_from_sender(settings.axes)
         placed = {name: (mesh.local + frame.transl) @ rotation.T for name, mesh in output.items()}
         if not all(np.isfinite(points).all() for points in placed.values()):
-            msg = "a garment isn't finite in this pose"
-            raise RefuError(msg)
+            raise RefuError("a garment isn't finite in this pose")
         return then(output, placed)
 
 
@@ -162,8 +160,7 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
     names, sdf = tuple(request.garments[:_MOST_GARMENTS]), request.sdf or settings.sdf
     known = list(dict.fromkeys([*settings.garments, *BUILTIN_GARMENTS]))
     if unknown := [name for name in names if name not in known] or request.garments[_MOST_GARMENTS:]:
-        msg = f"garments: wanted up to {_MOST_GARMENTS} of {', '.join(known)}, got {unknown[0]!r}"
-        raise RefuError(msg)
+        raise RefuError(f"garments: wanted up to {_MOST_GARMENTS} of {', '.join(known)}, got {unknown[0]!r}")
     # The style belongs to the garments in the parameters: others may have none.
     style = settings.style if names in ((), settings.garments) else (0.0,) * len(settings.style)
     asked = replace(settings, garments=names or settings.garments, sdf=sdf, style=style)
@@ -174,8 +171,7 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
 def asked_path(settings: NodeSettings, name: str) -> Path:
     """A path below the folder in the parameter `bags`. Raises `RefuError` for any other, links out of it included."""
     if not settings.bags:
-        msg = "a request may name no file: start the node with the parameter bags, a folder for them"
-        raise RefuError(msg)
+        raise RefuError("a request may name no file: start the node with the parameter bags, a folder for them")
     parts = name.split("/")
     # Path.resolve raises for links that lead in a circle; here they stay links.
     folder = Path(os.path.realpath(Path(settings.bags).expanduser()))
@@ -183,5 +179,4 @@ def asked_path(settings: NodeSettings, name: str) -> Path:
         path = Path(os.path.realpath(folder / name))
         if folder in path.parents and not path.is_symlink():
             return path
-    msg = f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}"
-    raise RefuError(msg)
+    raise RefuError(f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}")

@@ -291,8 +291,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         Raises `RefuError` where it can't.
         """
         if on and self._state != "active":
-            msg = f"the node is {self._state}: activate it first"
-            raise RefuError(msg)
+            raise RefuError(f"the node is {self._state}: activate it first")
         done = self.recording.switch(path or self.settings.record, on=on)
         self._attend()
         return done

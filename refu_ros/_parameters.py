@@ -90,8 +90,7 @@ def _coerced(name: str, value: Any, spec: Spec) -> Any:
     if not all(_is_of(kind, item) for item in items):
         hint = "an empty list" if kind is str else "whole numbers and decimals mixed; write all as decimals"
         hint = f": no value, or {hint}" if value is None and is_list else ""  # ROS turns these into None
-        msg = f"{name}: wanted {wanted}, got {value!r}{hint}"
-        raise SettingsError(msg)
+        raise SettingsError(f"{name}: wanted {wanted}, got {value!r}{hint}")
     return tuple(map(kind, items)) if is_list else kind(value)
 
 

@@ -23,8 +23,7 @@ def require_persons(persons: Sequence[str]) -> list[str]:
     """Those of the persons that have a name. Raises `SettingsError` unless names are distinct and good for topics."""
     named = [*filter(None, persons)]
     if not all(map(_PERSON.fullmatch, named)) or len(set(persons)) < len(persons):
-        msg = f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}"
-        raise SettingsError(msg)
+        raise SettingsError(f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}")
     return named
 
 
@@ -106,22 +105,18 @@ class NodeSettings(DressOptions):
             msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
             raise SettingsError(msg)
         if unknown := sorted(set(self.points_fields) - {"", *POINT_FIELDS}):
-            msg = f"points_fields: wanted names of {', '.join(POINT_FIELDS)}, got {', '.join(unknown)}"
-            raise SettingsError(msg)
+            raise SettingsError(f"points_fields: wanted names of {', '.join(POINT_FIELDS)}, got {', '.join(unknown)}")
         if not _FRAME.fullmatch(self.frame_id):
             msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {self.frame_id!r}"
             raise SettingsError(msg)
         for name, path in (("record", self.record), ("weights", self.weights), ("bags", self.bags)):
             if path and not _names_a_folder(path):
-                msg = f"{name}: wanted the path of a folder, got {path!r}"
-                raise SettingsError(msg)
+                raise SettingsError(f"{name}: wanted the path of a folder, got {path!r}")
         if 0 < self.max_rate < _SLOWEST_HZ:
-            msg = f"max_rate: wanted {_SLOWEST_HZ:g} to 1000, or 0 for no limit, got {self.max_rate:g}"
-            raise SettingsError(msg)
+            raise SettingsError(f"max_rate: wanted {_SLOWEST_HZ:g} to 1000, or 0 for no limit, got {self.max_rate:g}")
         self.check_garments()
         if any(self.style) and (plain := self.of_one_style):
-            msg = f"style: {', '.join(plain)} has no styles; set it to zeros"
-            raise SettingsError(msg)
+            raise SettingsError(f"style: {', '.join(plain)} has no styles; set it to zeros")
 
     def changed(self, values: Mapping[str, Any]) -> NodeSettings:
         """These settings with some values as ROS has them (lists, numbers of any kind). Raises `SettingsError`."""

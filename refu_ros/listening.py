@@ -26,8 +26,7 @@ class LiveTopics:
 
             from refu_ros._interfaces import interface
         except ImportError as error:
-            msg = f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})'
-            raise RefuError(msg) from error
+            raise RefuError(f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})') from error
         self._take, self._context = take, rclpy.Context()
         try:
             rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
@@ -39,8 +38,7 @@ class LiveTopics:
                 )
         except Exception as error:
             self._context.try_shutdown()
-            msg = f"no topics {', '.join(topics)}: {error}"
-            raise RefuError(msg) from error
+            raise RefuError(f"no topics {', '.join(topics)}: {error}") from error
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(node)
         self._thread = threading.Thread(target=self._executor.spin, name="topics", daemon=True)

@@ -77,8 +77,7 @@ class Budget:
         """Raises `DamageError` when there is nothing left."""
         left = self._left[what] - amount
         if left < 0:
-            msg = "more {} than a bag of this size has; the rest is left out"
-            raise DamageError(msg, what)
+            raise DamageError("more {} than a bag of this size has; the rest is left out", what)
         self._left[what] = left
 
 
@@ -90,8 +89,7 @@ class Fields:
 
     def take(self, size: int) -> memoryview:
         if size > len(self.left):
-            msg = "a field of {} bytes where {} are left"
-            raise DamageError(msg, size, len(self.left))
+            raise DamageError("a field of {} bytes where {} are left", size, len(self.left))
         view, self.left = self.left[:size], self.left[size:]
         return view
 
@@ -102,8 +100,7 @@ class Fields:
         try:
             return str(self.take(self.number(4)), "utf-8")
         except UnicodeDecodeError as error:
-            msg = "a string that isn't UTF-8 ({})"
-            raise DamageError(msg, error.reason) from None
+            raise DamageError("a string that isn't UTF-8 ({})", error.reason) from None
 
     def string_map(self, budget: Budget) -> dict[str, str]:
         entries, result = Fields(self.take(self.number(4))), {}
@@ -117,8 +114,7 @@ class Fields:
 def parse_message(content: memoryview) -> tuple[int, int, int, memoryview]:
     """A message's channel, log time and publish time [ns], and its payload, still a view. Raises `DamageError`."""
     if len(content) < _MESSAGE_HEADER.size:
-        msg = "a message record of {} bytes"
-        raise DamageError(msg, len(content))
+        raise DamageError("a message record of {} bytes", len(content))
     channel, _, log_ns, publish_ns = _MESSAGE_HEADER.unpack_from(content)
     return channel, log_ns, publish_ns, content[_MESSAGE_HEADER.size :]
 
@@ -129,8 +125,7 @@ def parse_message_counts(content: memoryview) -> dict[int, int]:
     fields.take(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)
     counts = Fields(fields.take(fields.number(4)))
     if len(counts.left) > _MAX_CHANNELS * 10:
-        msg = "statistics of more channels than there can be"
-        raise DamageError(msg)
+        raise DamageError("statistics of more channels than there can be")
     result = {}
     while counts.left:
         channel = counts.number(2)
@@ -146,19 +141,15 @@ def unpack_chunk(content: memoryview, budget: Budget) -> memoryview:
     compression = fields.string()
     packed = fields.take(fields.number(8))
     if size > MAX_CHUNK_BYTES:
-        msg = "a chunk that unpacks to {} MiB, at most {} are read"
-        raise DamageError(msg, size >> 20, MAX_CHUNK_BYTES >> 20)
+        raise DamageError("a chunk that unpacks to {} MiB, at most {} are read", size >> 20, MAX_CHUNK_BYTES >> 20)
     if size > max(_SMALL_CHUNK, _MAX_RATIO * len(packed)):
-        msg = "a chunk of {} bytes that unpacks to {} MiB"
-        raise DamageError(msg, len(packed), size >> 20)
+        raise DamageError("a chunk of {} bytes that unpacks to {} MiB", len(packed), size >> 20)
     budget.spend("bytes unpacked", size)
     records = packed if not compression else memoryview(_decompress(compression, packed, size))
     if len(records) != size:
-        msg = "a chunk that unpacks to {} bytes where {} were announced"
-        raise DamageError(msg, len(records), size)
+        raise DamageError("a chunk that unpacks to {} bytes where {} were announced", len(records), size)
     if crc and zlib.crc32(records) != crc:
-        msg = "a chunk whose checksum is wrong"
-        raise DamageError(msg)
+        raise DamageError("a chunk whose checksum is wrong")
     return records
 
 
@@ -171,21 +162,17 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
             ) as reader:
                 return reader.read(size + 1)
         except (zstandard.ZstdError, MemoryError) as error:
-            msg = "a chunk that zstd can't unpack ({})"
-            raise DamageError(msg, error) from None
+            raise DamageError("a chunk that zstd can't unpack ({})", error) from None
     if compression == "lz4":
         try:
             lz4 = import_module("lz4.frame")  # optional: rosbag2 compresses with zstd
         except ImportError as error:
-            msg = "the bag is compressed with lz4; install it: pip install lz4"
-            raise BagError(msg) from error
+            raise BagError("the bag is compressed with lz4; install it: pip install lz4") from error
         try:
             return bytes(lz4.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
         except (RuntimeError, EOFError, MemoryError) as error:
-            msg = "a chunk that lz4 can't unpack ({})"
-            raise DamageError(msg, error) from None
-    msg = "a chunk of unknown compression {!r}"
-    raise DamageError(msg, compression)
+            raise DamageError("a chunk that lz4 can't unpack ({})", error) from None
+    raise DamageError("a chunk of unknown compression {!r}", compression)
 
 
 def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -193,15 +180,13 @@ def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
     at = 0
     while at < len(content):
         if len(content) - at < _RECORD_HEADER.size:
-            msg = "{} bytes where a record should start"
-            raise DamageError(msg, len(content) - at)
+            raise DamageError("{} bytes where a record should start", len(content) - at)
         opcode, length = _RECORD_HEADER.unpack_from(content, at)
         if opcode == 0:
             raise DamageError(_NO_OPCODE)
         at += _RECORD_HEADER.size
         if length > len(content) - at:
-            msg = "a record of {} bytes where {} are left"
-            raise DamageError(msg, length, len(content) - at)
+            raise DamageError("a record of {} bytes where {} are left", length, len(content) - at)
         yield opcode, content[at : at + length]
         at += length
 
@@ -213,8 +198,7 @@ def open_bag_file(path: Path) -> tuple[BinaryIO, bytes]:
         return file, file.read(_LONGEST_MAGIC)
     except OSError as error:
         file.close()
-        msg = f"{path}: can't be read: {error.strerror}"
-        raise BagError(msg) from error
+        raise BagError(f"{path}: can't be read: {error.strerror}") from error
 
 
 def read_summary(file: BinaryIO) -> Iterable[tuple[int, memoryview]]:
@@ -252,8 +236,7 @@ def iter_records(file: BinaryIO) -> Iterator[tuple[int, memoryview, int]]:
     while True:
         header = file.read(_RECORD_HEADER.size)
         if len(header) < _RECORD_HEADER.size:
-            msg = "the file ends at byte {} without its closing records"
-            raise DamageError(msg, size)
+            raise DamageError("the file ends at byte {} without its closing records", size)
         opcode, length = _RECORD_HEADER.unpack(header)
         if opcode == 0:
             raise DamageError(_NO_OPCODE)

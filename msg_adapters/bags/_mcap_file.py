@@ -105,8 +105,7 @@ class McapFile:
             except DamageError as damage:
                 self.report(damage)
             except OSError as error:
-                msg = f"{self._path}: can't be read: {error.strerror}"
-                raise BagError(msg) from error
+                raise BagError(f"{self._path}: can't be read: {error.strerror}") from error
 
     def _summary(self, budget: Budget) -> tuple[_Catalogue, Mapping[int, int] | None]:
         """The channels that the summary at the file's end declares, and their message counts (None: it gives none)."""

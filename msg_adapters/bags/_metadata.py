@@ -107,8 +107,7 @@ def _load(text: str | bytes) -> Any:
     for count, event in enumerate(yaml.parse(text, Loader=_PARSER)):
         is_odd |= count > _MAX_EVENTS or len(nodes) > _MAX_DEPTH or isinstance(event, yaml.AliasEvent)
         if is_odd:
-            msg = "directives, aliases, or more than is read"
-            raise yaml.YAMLError(msg)
+            raise yaml.YAMLError("directives, aliases, or more than is read")
         if isinstance(event, yaml.ScalarEvent):
             nodes[-1].append(_scalar(event.value) if event.implicit[0] else event.value)
         elif isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):

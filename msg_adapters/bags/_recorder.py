@@ -63,8 +63,7 @@ def free_path(path: Path) -> Path:
     Raises `BagError` if something that isn't a bag is in the way, or if the name has unprintable characters.
     """
     if not str(path).isprintable():
-        msg = f"{path}: wanted a name of printable characters"
-        raise BagError(msg)
+        raise BagError(f"{path}: wanted a name of printable characters")
     if path.name and path.is_dir() and any(path.iterdir()) and not any(map(_is_of_bag, path.iterdir())):
         path /= "garments"
     names = (f"{path.stem}-{i}{path.suffix}" for i in itertools.count(1))
@@ -73,8 +72,7 @@ def free_path(path: Path) -> Path:
             return candidate
         if not (candidate.is_dir() or (path.suffix == ".mcap" and candidate.is_file())):
             break
-    msg = f"{path}: {candidate} isn't a bag; wanted a directory, or a .mcap file, that is new"
-    raise BagError(msg)
+    raise BagError(f"{path}: {candidate} isn't a bag; wanted a directory, or a .mcap file, that is new")
 
 
 def _is_of_bag(file: Path) -> bool:
@@ -123,8 +121,7 @@ class Recorder:
         except BagError:
             raise
         except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: an unknown ~user
-            msg = f"{path}: can't be recorded to: {getattr(error, 'strerror', None) or error}"
-            raise BagError(msg) from error
+            raise BagError(f"{path}: can't be recorded to: {getattr(error, 'strerror', None) or error}") from error
         self._sync_after = 0.5 * sync_period if sync_period else math.inf
         self._max_queued_bytes = max_queued_bytes
         self._changed = threading.Condition()

@@ -128,11 +128,9 @@ class BagWriter:
         Raises `BagError` for an undeclared topic, a time that rosbag2 can't hold, and when writing fails.
         """
         if topic not in self._topics:
-            msg = f"{self.path}: {topic} isn't declared; call add_topic first"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: {topic} isn't declared; call add_topic first")
         if not 0 <= log_time_ns <= MAX_TIME_NS:
-            msg = f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}")
         with self._writing():
             self._writer.add_message(
                 self._channels[topic],
@@ -211,8 +209,7 @@ class BagWriter:
             self._made.append(folder)
         self._entered = [*(folder.parent for folder in self._made), parent]
         if overwrite and self.file_path.is_fifo():
-            msg = f"{self.path}: a FIFO; choose another path"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: a FIFO; choose another path")
         if overwrite and (self._old or self.file_path.is_file()):
             self._target = Path(os.path.realpath(self.file_path))
             self._working = self._target.with_name(f"{self._target.name}{_PARTIAL}")
@@ -220,8 +217,7 @@ class BagWriter:
         try:
             stream = self._working.open("wb" if overwrite else "xb")
         except FileExistsError as error:
-            msg = f"{self.path}: exists already; choose another path, or overwrite it"
-            raise BagError(msg) from error
+            raise BagError(f"{self.path}: exists already; choose another path, or overwrite it") from error
         if is_new:
             self._made.append(self._working)
         return stream
@@ -239,24 +235,21 @@ class BagWriter:
                 if overwrite
                 else "choose another path, or overwrite it"
             )
-            msg = f"{directory}: the directory isn't empty; {hint}"
-            raise BagError(msg)
+            raise BagError(f"{directory}: the directory isn't empty; {hint}")
         return [file for file in found if not file.name.endswith(_PARTIAL)]
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         """Turn file system errors into a `BagError` of one line, and leave a readable file whatever interrupts."""
         if self._finished:
-            msg = f"{self.path}: the bag is finished; nothing can be added"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: the bag is finished; nothing can be added")
         try:
             yield
         except BagError:
             raise
         except (OSError, ValueError) as error:  # ValueError: a name that no file system takes
             self._abandon()
-            msg = f"{self.path}: can't be written: {getattr(error, 'strerror', None) or error}"
-            raise BagError(msg) from error
+            raise BagError(f"{self.path}: can't be written: {getattr(error, 'strerror', None) or error}") from error
         except BaseException:
             self._abandon()
             raise

@@ -60,8 +60,7 @@ class _Layout:
         places: dict[str, tuple[int, int]] = {}
         for position, name in enumerate(names):
             if name in places:
-                msg = f"the name {name} occurs twice"
-                raise DecodeError(msg)
+                raise DecodeError(f"the name {name} occurs twice")
             if name in slots:
                 places[name] = position, slots[name]
         if missing := [name for name in required if name not in places]:
@@ -70,8 +69,7 @@ class _Layout:
             raise DecodeError(msg)
         n_transl = sum(name in places for name in _TRANSL_NAMES)
         if n_transl not in (0, len(_TRANSL_NAMES)):
-            msg = f"{n_transl} of transl_x, transl_y, transl_z given; wanted all three or none"
-            raise DecodeError(msg)
+            raise DecodeError(f"{n_transl} of transl_x, transl_y, transl_z given; wanted all three or none")
         given, wanted = zip(*places.values(), strict=True)
         return cls(len(names), np.array(given, np.intp), np.array(wanted, np.intp), body is not None)
 

@@ -49,8 +49,7 @@ def _input_type(name: str) -> str:
         if name == input_type or full_name == message_type:
             return input_type
     known = ", ".join(f"{input_type} ({message_type})" for input_type, message_type in INPUT_TYPES.items())
-    msg = f"wanted an input type, got {name!r}; there are {known}"
-    raise DecodeError(msg)
+    raise DecodeError(f"wanted an input type, got {name!r}; there are {known}")
 
 
 def decoder_for(name: str, *, definition: str | None = None) -> Decoder:

@@ -44,8 +44,7 @@ def body_of(names: Sequence[str]) -> str | None:
     """The id of the body whose joints these are, None for other names; raises `DecodeError` for several bodies."""
     bodies = [name.removeprefix("waist_") for name in names if name.startswith("waist_")]
     if len(bodies) > 1:
-        msg = f"wanted the joints of one body, got {len(bodies)} names that begin with waist_"
-        raise DecodeError(msg)
+        raise DecodeError(f"wanted the joints of one body, got {len(bodies)} names that begin with waist_")
     return bodies[0] if bodies else None
 
 
@@ -56,8 +55,7 @@ def pose_of(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     bad = np.flatnonzero(~(np.abs(angles) <= MAX_ANGLE))
     if bad.size:
-        msg = f"{[*AXES][bad[0]]} has the angle {angles[bad[0]]:g}, wanted radians"
-        raise DecodeError(msg)
+        raise DecodeError(f"{[*AXES][bad[0]]} has the angle {angles[bad[0]]:g}, wanted radians")
     vectors = angles[:, None] * _AXES
     turns = Rotation.from_rotvec(vectors)
     first, second, third, hinge = (turns[4 + joint :: 4] for joint in range(4))  # of the four limbs

@@ -37,8 +37,7 @@ def parse_layout(definition: str) -> Layout:
     lines = [line for line in lines if line]
     with decoding(MESSAGE_TYPE):
         if not lines or not _HEADER.fullmatch(lines[0]):
-            msg = f"wanted a definition that starts with 'std_msgs/Header header', got {lines[:1]}"
-            raise DecodeError(msg)
+            raise DecodeError(f"wanted a definition that starts with 'std_msgs/Header header', got {lines[:1]}")
         layout = []
         for line in lines[1:]:
             field = _ARRAY.fullmatch(line)
@@ -49,8 +48,7 @@ def parse_layout(definition: str) -> Layout:
         sizes = {name: size for name, _, size in layout}
         for name, size in _SIZES.items():
             if sizes.get(name) != size:
-                msg = f"wanted {name}[{size}] in the definition, got {sizes.get(name, 'no such field')}"
-                raise DecodeError(msg)
+                raise DecodeError(f"wanted {name}[{size}] in the definition, got {sizes.get(name, 'no such field')}")
     return tuple(layout)
 
 

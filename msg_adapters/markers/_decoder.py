@@ -91,11 +91,9 @@ def vertices_from_points(
     used = np.zeros(count, dtype=bool)
     used[corners] = True
     if not used.all():
-        msg = f"vertex {int(np.argmin(used))} of {count} is in no triangle; its position can't be known"
-        raise DecodeError(msg)
+        raise DecodeError(f"vertex {int(np.argmin(used))} of {count} is in no triangle; its position can't be known")
     vertices = np.empty((count, 3))
     vertices[corners] = points
     if not np.array_equal(vertices[corners], points):
-        msg = "the points' shared corners differ: they were made with other faces"
-        raise DecodeError(msg)
+        raise DecodeError("the points' shared corners differ: they were made with other faces")
     return vertices

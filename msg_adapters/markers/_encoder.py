@@ -28,11 +28,9 @@ def numbers(what: str, values: Any) -> NDArray[Any]:
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:
-        msg = f"{what}: wanted an array of numbers, got {type(values).__name__}: {error}"
-        raise EncodeError(msg) from None
+        raise EncodeError(f"{what}: wanted an array of numbers, got {type(values).__name__}: {error}") from None
     if array.dtype.kind not in "iuf":
-        msg = f"{what}: wanted an array of numbers, got {array.dtype} of shape {array.shape}"
-        raise EncodeError(msg)
+        raise EncodeError(f"{what}: wanted an array of numbers, got {array.dtype} of shape {array.shape}")
     return array
 
 
@@ -40,8 +38,7 @@ def finite_points(what: str, values: ArrayLike) -> NDArray[Any]:
     """Finite points as an array of shape (K, 3), K > 0. Raises `EncodeError` for anything else."""
     points = numbers(what, values)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
-        msg = f"{what}: wanted finite points of shape (K, 3), K > 0, got {points.shape}"
-        raise EncodeError(msg)
+        raise EncodeError(f"{what}: wanted finite points of shape (K, 3), K > 0, got {points.shape}")
     return points
 
 
@@ -52,8 +49,7 @@ def triangles(what: str, faces: ArrayLike, n_vertices: int) -> NDArray[np.intege
         msg = f"{what}: wanted faces of shape (F, 3) of integers, F > 0, got {array.shape} of {array.dtype}"
         raise EncodeError(msg)
     if array.min() < 0 or array.max() >= n_vertices:
-        msg = f"{what}: wanted face indices in [0, {n_vertices}), got {array.min()} ... {array.max()}"
-        raise EncodeError(msg)
+        raise EncodeError(f"{what}: wanted face indices in [0, {n_vertices}), got {array.min()} ... {array.max()}")
     return array
 
 
@@ -153,11 +149,9 @@ class MarkerArrayEncoder:
     ) -> None:
         names = [mesh.ns for mesh in meshes]
         if not names or len(set(names)) != len(names):
-            msg = f"wanted meshes with distinct namespaces, got {names}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted meshes with distinct namespaces, got {names}")
         if axes not in SMPL_COLUMNS:
-            msg = f"wanted axes {' or '.join(SMPL_COLUMNS)}, got {axes!r}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted axes {' or '.join(SMPL_COLUMNS)}, got {axes!r}")
         self._columns = SMPL_COLUMNS[axes]
         writer = CdrWriter()
         writer.fields("I", len(meshes))
@@ -196,13 +190,11 @@ class MarkerArrayEncoder:
         """
         n = len(self._slots)
         if len(vertices) != n:
-            msg = f"wanted vertices of {n} meshes, got {len(vertices)}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted vertices of {n} meshes, got {len(vertices)}")
         each = [stamp_ns] * n if isinstance(stamp_ns, (int, np.integer)) else stamp_ns
         stamps = [split_stamp(stamp) for stamp in each]
         if len(stamps) != n:
-            msg = f"wanted a stamp for all meshes or {n} stamps, got {len(stamps)}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted a stamp for all meshes or {n} stamps, got {len(stamps)}")
         offsets = self._offsets(transl)
         for i, slot in enumerate(self._slots):
             struct.pack_into("<iI", self._payload, slot.stamp_at, *stamps[i])
@@ -212,8 +204,7 @@ class MarkerArrayEncoder:
     def _offsets(self, transl: ArrayLike | None) -> NDArray[np.float64]:
         offsets = np.zeros(3) if transl is None else numbers("transl", transl).astype(np.float64)
         if offsets.shape not in ((3,), (len(self._slots), 3)):
-            msg = f"wanted a translation of shape (3,) or ({len(self._slots)}, 3), got {offsets.shape}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted a translation of shape (3,) or ({len(self._slots)}, 3), got {offsets.shape}")
         return np.broadcast_to(offsets, (len(self._slots), 3))
 
     def _write_points(self, slot: _Slot, vertices: NDArray[Any], offset: NDArray[np.float64]) -> None:
@@ -255,8 +246,7 @@ def encode_lists(
     options["lifetime_ns"] = lifetime_ns
     for ns, stamp_ns, pose, points in lists:
         if not np.isfinite(pose).all():
-            msg = f"{ns}: wanted a finite pose, got {pose}"
-            raise EncodeError(msg)
+            raise EncodeError(f"{ns}: wanted a finite pose, got {pose}")
         _write_marker(writer, ns=ns, stamp_ns=stamp_ns, points=finite_points(ns, points), pose=pose, **options)
     return writer.to_bytes()
 

@@ -125,8 +125,7 @@ def encode_scene(
     for one in entities:
         mesh, vertices = one.mesh, finite_points(one.mesh.ns, one.vertices)
         if len(vertices) != mesh.n_vertices:
-            msg = f"{mesh.ns}: wanted {mesh.n_vertices} vertices, got {len(vertices)}"
-            raise EncodeError(msg)
+            raise EncodeError(f"{mesh.ns}: wanted {mesh.n_vertices} vertices, got {len(vertices)}")
         writer.fields("TssT?", one.stamp_ns, frame_id, mesh.ns, lifetime_ns, False)  # frame_locked
         writer.fields("IIIIII", *[0] * 6)  # metadata, arrows, cubes, spheres, cylinders, lines
         writer.fields("I", 1)

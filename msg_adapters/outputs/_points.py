@@ -94,8 +94,7 @@ class PointCloudEncoder:
         for part, array in zip(self._slices, arrays, strict=True):
             values = np.asarray(array)
             if values.shape != target[part].shape:
-                msg = f"{what}: wanted numbers of shape {target[part].shape}, got {values.shape}"
-                raise EncodeError(msg)
+                raise EncodeError(f"{what}: wanted numbers of shape {target[part].shape}, got {values.shape}")
             with np.errstate(invalid="ignore", over="ignore"):
                 if values.ndim == 1:
                     target[part] = values
@@ -105,8 +104,7 @@ class PointCloudEncoder:
                 is_finite = np.isfinite(values.sum() + offset.sum())
             if not (is_finite or np.isfinite(target[part]).all()):
                 bad = int(np.count_nonzero(~np.isfinite(target[part])))
-                msg = f"{what}: {bad} of {values.size} are NaN or infinite"
-                raise EncodeError(msg)
+                raise EncodeError(f"{what}: {bad} of {values.size} are NaN or infinite")
 
 
 def _layout(fields: Sequence[str], *, most_vertices: int) -> np.dtype[Any]:
@@ -138,8 +136,7 @@ def points_of(message: Any) -> NDArray[Any]:
     (height, width), (step, row_step) = (message.height, message.width), (message.point_step, message.row_step)
     try:
         if height > 1 and row_step < width * step:
-            msg = f"a row has {row_step}"
-            raise ValueError(msg)
+            raise ValueError(f"a row has {row_step}")
         kinds = [(_KINDS[one.datatype], (one.count,)) if one.count > 1 else _KINDS[one.datatype] for one in fields]
         places = {"names": [one.name for one in fields], "offsets": [one.offset for one in fields]}
         layout: Any = {**places, "formats": kinds, "itemsize": step}

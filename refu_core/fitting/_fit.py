@@ -118,15 +118,13 @@ def fit_garment(
     require_type(body, SmplBody, "an SmplBody, such as load_body gives", error=GarmentError)
     details = GarmentDetails() if details is None else details
     if details.held_at not in (None, *HOLDS):
-        msg = f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}"
-        raise GarmentError(msg)
+        raise GarmentError(f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}")
     require_name(name)
     if body.name not in BUILTIN_BODIES:
-        msg = (
+        raise GarmentError(
             f"a garment is cut for one of {', '.join(BUILTIN_BODIES)}, got the body {body.name}: add it for the one "
             f"that is most like it; a replay or pipeline with {body.name} as its body (--body) then wears it, too"
         )
-        raise GarmentError(msg)
     cleaned, notes = clean(mesh)
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
@@ -182,8 +180,7 @@ def _require_worn(mesh: SurfaceMesh) -> None:
     area = np.linalg.norm(normals, axis=1)
     along = np.linalg.eigvalsh(normals.T @ (normals / np.maximum(area, 1e-300)[:, None]))[-1] / area.sum()
     if along > _FLAT:
-        msg = "it is flat, as a sewing pattern is: wanted a garment as it is worn; sew and drape it first"
-        raise GarmentError(msg)
+        raise GarmentError("it is flat, as a sewing pattern is: wanted a garment as it is worn; sew and drape it first")
 
 
 class _Worn(NamedTuple):
@@ -248,8 +245,7 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
     if details.held_at is None:
         notes.append(f"held at the {held_at}")
     if held_at == "waist" and not len(Connectivity.of(mesh.faces, len(vertices)).boundary):
-        msg = "a garment that is held at the waist needs an open rim there: its mesh is closed"
-        raise GarmentError(msg)
+        raise GarmentError("a garment that is held at the waist needs an open rim there: its mesh is closed")
     joints = tuple(int(j) for j in np.flatnonzero(weights.max(0) > _FELT))
     try:
         card = GarmentCard(details.layer, details.color, joints, held_at == "waist", (), details.provenance)

@@ -87,8 +87,7 @@ class Placing:
             msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
             raise GarmentError(msg)
         if self.pose is not None and not (np.shape(self.pose) == (N_JOINTS, 3) and np.isfinite(self.pose).all()):
-            msg = f"wanted a pose of {N_JOINTS} finite rotation vectors, got {self.pose!r}"
-            raise GarmentError(msg)
+            raise GarmentError(f"wanted a pose of {N_JOINTS} finite rotation vectors, got {self.pose!r}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,8 +52,7 @@ class Proportions:
         """The proportions of a built-in body. Raises `BodyError`."""
         keys = ("v_template", "J_regressor", "shapedirs")
         if name not in BUILTIN_BODIES:
-            msg = f"no built-in body {name!r}: wanted one of {', '.join(BUILTIN_BODIES)}"
-            raise BodyError(msg)
+            raise BodyError(f"no built-in body {name!r}: wanted one of {', '.join(BUILTIN_BODIES)}")
         with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
             data = read_npz(path, keys=keys, error=BodyError, wanted="a body model")
         regressor = np.asarray(data["J_regressor"], np.float64)

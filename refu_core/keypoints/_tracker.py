@@ -137,8 +137,7 @@ class KeypointTracker:
             given = np.asarray(points, np.float64)
             weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
         except (TypeError, ValueError) as error:
-            msg = f"wanted {n} keypoints of {self.skeleton.layout.name} as numbers: {error}"
-            raise FrameError(msg) from error
+            raise FrameError(f"wanted {n} keypoints of {self.skeleton.layout.name} as numbers: {error}") from error
         if given.shape != (n, 3) or weights.shape != (n,):
             msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"
             raise FrameError(msg)

@@ -72,8 +72,7 @@ def read_bvh(
         rate = check_fps(fps if fps is not None else 1 / seconds if seconds > 0 else 0.0)
         return _fitted(joints, _placed(joints, rows), rate, axes, worn)
     except ValueError as cause:
-        msg = f"{path}: {cause}"
-        raise error(msg) from cause
+        raise error(f"{path}: {cause}") from cause
 
 
 def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
@@ -82,8 +81,7 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     hierarchy = re.sub(r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)", _one_word, hierarchy)
     head = re.match(r"\s*Frames:\s*(\d+)\s+Frame\s+Time:\s*([-+.\deE]+)", motion) if word else None
     if head is None:
-        msg = "not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:"
-        raise ValueError(msg)
+        raise ValueError("not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:")
     joints = _joints(iter(hierarchy.split()))
     n_channels, count = sum(len(joint.channels) for joint in joints), int(head[1])
     numbers = np.array(motion[head.end() :].split(), dtype=np.float64)
@@ -115,18 +113,14 @@ def _joints(words: Iterator[str]) -> list[_Joint]:
             elif word == "CHANNELS":
                 joints[open_[-1]].channels = [next(words).lower() for _ in range(int(next(words)))]
             if len(joints) > _MAX_JOINTS:
-                msg = f"more than {_MAX_JOINTS} joints"
-                raise ValueError(msg)
+                raise ValueError(f"more than {_MAX_JOINTS} joints")
     except (StopIteration, IndexError) as cause:
-        msg = "its hierarchy is cut short"
-        raise ValueError(msg) from cause
+        raise ValueError("its hierarchy is cut short") from cause
     if open_:
-        msg = f"its hierarchy is cut short: {len(open_)} braces are never closed"
-        raise ValueError(msg)
+        raise ValueError(f"its hierarchy is cut short: {len(open_)} braces are never closed")
     unknown = [name for joint in joints for name in joint.channels if name not in _CHANNELS]
     if not joints or unknown:
-        msg = f"unknown channel {unknown[0]!r}" if unknown else "no joints"
-        raise ValueError(msg)
+        raise ValueError(f"unknown channel {unknown[0]!r}" if unknown else "no joints")
     return joints
 
 
@@ -148,8 +142,7 @@ def _placed(joints: list[_Joint], rows: Array) -> Array:
         if order and len(set(order)) == len(order):
             turn = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True).as_matrix()
         elif order:
-            msg = f"{joint.name} turns twice about one axis: {order}"
-            raise ValueError(msg)
+            raise ValueError(f"{joint.name} turns twice about one axis: {order}")
         else:
             turn = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
         if joint.parent < 0:
@@ -167,8 +160,7 @@ def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: P
     missing = [name for name in _NEEDED if name not in points]
     if missing:
         names = ", ".join(joint.name for joint in joints[:12] if joint.name)
-        msg = f"not a person's skeleton, or its names aren't known: no {', '.join(missing)} among {names} …"
-        raise ValueError(msg)
+        raise ValueError(f"not a person's skeleton, or its names aren't known: no {', '.join(missing)} among {names} …")
     notes: list[str] = []
     scale = metres_of(list(points), places[0, list(points.values())], notes)
     seen = scale * places[:, list(points.values())]

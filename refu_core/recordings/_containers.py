@@ -76,8 +76,7 @@ class Content:
         if _is_list(value):  # a shared list is converted once, but counts each time it is seen
             self._left -= len(value) if known is None else known[1].size
         if depth > MOST_DEPTH or self._left < 0:
-            msg = f"lists of lists, more than {MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
-            raise ValueError(msg)
+            raise ValueError(f"lists of lists, more than {MOST_DEPTH} deep or of more than {_MOST_ITEMS} items")
         if known is not None:
             return known[1]
         try:
@@ -85,8 +84,7 @@ class Content:
                 rows = [self._array(item, depth + 1) for item in value]
                 shapes = sorted({row.shape for row in rows})
                 if len(shapes) > 1:
-                    msg = f"a list of arrays of several shapes: {', '.join(map(str, shapes[:4]))}"
-                    raise ValueError(msg)
+                    raise ValueError(f"a list of arrays of several shapes: {', '.join(map(str, shapes[:4]))}")
                 array = np.stack(rows)
             else:
                 array = self._arrays.of(value)
@@ -212,8 +210,7 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
             is_other = path.suffix and path.suffix.lower() not in SUFFIXES
             why = f"no file of motion is a {path.suffix}" if is_other else told(cause)
             hint = JSON_ADVICE if path.suffix.lower() == ".json" else ""
-            msg = f"{path}: can't be read: {why}; wanted {WANTED}{hint}"
-            raise error(msg) from cause
+            raise error(f"{path}: can't be read: {why}; wanted {WANTED}{hint}") from cause
 
 
 def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
@@ -263,8 +260,7 @@ def _columns(path: Path, names: Collection[str], error: type[RefuError]) -> dict
                 if shape and max(shape) == math.prod(shape) and dtype.kind in "biufUS":
                     columns[name] = npy.read_array(io.BytesIO(data), allow_pickle=False)
     except DAMAGE as cause:
-        msg = f"{path}: can't be read as .npz: {told(cause)}; wanted {WANTED}"
-        raise error(msg) from cause
+        raise error(f"{path}: can't be read as .npz: {told(cause)}; wanted {WANTED}") from cause
     return columns
 
 
@@ -303,8 +299,7 @@ def _unpacked(packed: bytes, unpacker: Any) -> bytes:
     """The unpacked data. Raises `ValueError` if it is cut short, or larger than `_MOST_HELD`."""
     unpacked: bytes = unpacker.decompress(packed, _MOST_HELD + 1)
     if not unpacker.eof or len(unpacked) > _MOST_HELD:
-        msg = f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short"
-        raise ValueError(msg)
+        raise ValueError(f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short")
     return unpacked
 
 
@@ -322,13 +317,11 @@ def _torch(path: Path, error: type[RefuError]) -> Content:
             tree = Unpickler(io.BytesIO(_member(archive, name))).load()
         return Content(tree, storage)
     except DAMAGE as cause:
-        msg = f"{path}: can't be read as a file of torch: {told(cause)}; wanted {WANTED}"
-        raise error(msg) from cause
+        raise error(f"{path}: can't be read as a file of torch: {told(cause)}; wanted {WANTED}") from cause
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
     entry = archive.getinfo(name)
     if entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_PICKLE_BYTES:
-        msg = f"{name} is compressed, or has {entry.file_size >> 20} MiB"
-        raise ValueError(msg)
+        raise ValueError(f"{name} is compressed, or has {entry.file_size >> 20} MiB")
     return archive.read(entry)

@@ -139,8 +139,7 @@ def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
         arrays: dict[Key, Any] = {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
         return arrays | {table.MODELS[0]: "smplx"}
     if array.ndim == 2 and array.shape[1] == 263:
-        msg = f"263 columns are HumanML3D features; {table.UNREAD_ADVICE['HumanML3D features']}"
-        raise ValueError(msg)
+        raise ValueError(f"263 columns are HumanML3D features; {table.UNREAD_ADVICE['HumanML3D features']}")
     return {"poses": array}
 
 

@@ -52,8 +52,7 @@ def follow(
     shapes = [KeypointTracker(skeleton, settings=_SETTINGS).update(places[i], 0) for i in some]
     known = [frame.betas for frame in shapes if frame is not None]
     if not known:
-        msg = "its joints are in no order that a person's are in"
-        raise ValueError(msg)
+        raise ValueError("its joints are in no order that a person's are in")
     betas = np.median(known, axis=0)
     track = KeypointTracker(skeleton, betas=betas, settings=_SETTINGS)
     frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
@@ -98,8 +97,7 @@ def metres_of(points: Sequence[str], places: NDArray[np.float64], notes: list[st
     leg = sum(float(np.linalg.norm(at[a] - at[b])) for a, b in pairwise(ends))
     leg *= 1.0 if len(ends) == 3 else 2.0
     if not leg > 0:
-        msg = "its legs have no length"
-        raise ValueError(msg)
+        raise ValueError("its legs have no length")
     unit = min(_UNITS, key=lambda name: abs(np.log(leg * _UNITS[name] / _LEG)))
     scale = _UNITS[unit]
     if not _LEGS[0] <= leg * scale <= _LEGS[1]:

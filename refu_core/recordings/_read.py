@@ -63,15 +63,13 @@ def read_recording(
     person = None if person is None else str(person)
     if path.suffix.lower() == ".bvh":
         if person is not None:
-            msg = f"{path}: no person {person!r}; a BVH file has one, without a name: leave the person out"
-            raise error(msg)
+            raise error(f"{path}: no person {person!r}; a BVH file has one, without a name: leave the person out")
         return read_bvh(path, error=error, fps=fps, axes=axes, worn=worn)
     content = open_content(path, error=error)
     try:
         return _recording(content, fps=fps, axes=axes, person=person, worn=worn)
     except ValueError as cause:
-        msg = f"{path}: {cause}"
-        raise error(msg) from cause
+        raise error(f"{path}: {cause}") from cause
 
 
 def _recording(
@@ -224,8 +222,7 @@ def _poses(
                 raise ValueError(msg)
             body, n = body[:, 1:], n - 1
         if len(root) != len(body):
-            msg = f"{names[0]} has {len(root)} frames, {names[1]} {len(body)}; wanted as many"
-            raise ValueError(msg)
+            raise ValueError(f"{names[0]} has {len(root)} frames, {names[1]} {len(body)}; wanted as many")
     else:
         whole, n = rotvecs_of(given[0], names[0], (*WHOLE, *BODY), notes, has_root=True)
         if n in BODY:
@@ -244,8 +241,7 @@ def _poses(
             root, body, n = whole[:, :1], whole[:, 1:], n - 1
     kept = n if n == N_JOINTS - 1 else _BODY_JOINTS - 1
     if len(body) > MAX_FRAMES:
-        msg = f"{len(body)} frames, at most {MAX_FRAMES} are read; cut the clip"
-        raise ValueError(msg)
+        raise ValueError(f"{len(body)} frames, at most {MAX_FRAMES} are read; cut the clip")
     poses = np.zeros((len(body), N_JOINTS, 3))
     poses[:, :1], poses[:, 1 : 1 + kept] = root, body[:, :kept]
     return poses, 1 + n

@@ -81,8 +81,7 @@ def _people(content: Content, node: Mapping[Key, Any], n: int, notes: list[str])
     by = [name for name, given in (("their images' folders", folders), ("their column of persons", persons)) if given]
     notes.append(f"the rows are {len(rows)} persons', told apart by {' and '.join(by)}")
     if len(rows) > _MOST_PERSONS:
-        msg = f"{len(rows)} persons, at most {_MOST_PERSONS} are told apart; save fewer of them in a file"
-        raise ValueError(msg)
+        raise ValueError(f"{len(rows)} persons, at most {_MOST_PERSONS} are told apart; save fewer of them in a file")
     return _tracks(content, node, n, rows, numbers)
 
 

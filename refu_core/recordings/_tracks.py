@@ -50,8 +50,7 @@ def frames_of(content: Content) -> Mapping[Any, Any]:
 
 def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str, Any]:
     if len(frames) > MAX_FRAMES:
-        msg = f"{len(frames)} frames, at most {MAX_FRAMES} are read; cut the clip"
-        raise ValueError(msg)
+        raise ValueError(f"{len(frames)} frames, at most {MAX_FRAMES} are read; cut the clip")
     layout = next(_layout_of(content, bodies[0]) for bodies in frames if bodies)
     assert layout is not None
     named = _who_is_who([(_name_of(body), _place_of(content, body, layout)) for body in bodies] for bodies in frames)
@@ -171,8 +170,7 @@ def _stacked(content: Content, layout: table.Layout, seen: list[tuple[int, Mappi
             continue
         flat = [content.array(row).reshape(-1) for row in rows]
         if len({len(row) for row in flat}) > 1:
-            msg = f"{name} has {len(flat[0])} numbers in one frame and others in another"
-            raise ValueError(msg)
+            raise ValueError(f"{name} has {len(flat[0])} numbers in one frame and others in another")
         track[name] = np.stack(flat)
     return track
 
