@@ -102,10 +102,8 @@ class InputStream:
         for name, seen in people.items():
             person = "_".join(word for word in (sender, name) if word)
             frame_ids[person] = seen.frame_id
-            own = followed.update(
-                person, seen.points, confidence=seen.confidence, stamp_ns=seen.stamp_ns or now_ns, now_ns=now_ns
-            )
-            if own is not None:
+            times = {"stamp_ns": seen.stamp_ns or now_ns, "now_ns": now_ns}
+            if (own := followed.update(person, seen.points, confidence=seen.confidence, **times)) is not None:
                 frames[person] = own
         return frames, frame_ids
 
@@ -140,14 +138,11 @@ class Track:
         found = {}
         longest, steps = float(np.median(rows[:, 0])), np.diff(rows[:, 1])
         if longest > LONGEST_TURN:
-            text = f"rotation vectors are as long as {longest:.0f} in most frames, wanted radians: degrees?"
-            found["angles"] = text
+            found["angles"] = f"rotation vectors are as long as {longest:.0f} in most frames, wanted radians: degrees?"
         way, told = np.linalg.norm(np.diff(rows[:, 5:], axis=0), axis=1), steps >= _SHORTEST_S
         if told.any() and (pace := float(np.median(way[told] / steps[told]))) > FASTEST:
-            text = (
-                f"people move by {pace:.0f} m/s in most frames: translations in cm or mm? Or two senders on one topic?"
-            )
-            found["pace"] = text
+            why = "translations in cm or mm? Or two senders on one topic?"
+            found["pace"] = f"people move by {pace:.0f} m/s in most frames: {why}"
         if len(steps) and (n_still := int((steps <= 0).sum())) > len(steps) / 2:
             found["stamps"] = f"stamps don't advance in {n_still} of {len(rows)} frames: does the sender's clock run?"
         elif len(steps) and not _SHORTEST_S <= (step := float(np.median(steps))) <= _LONGEST_S:
@@ -155,10 +150,8 @@ class Track:
         share, axis = upright_share(rows[:, 2:5]), axis_of(rows[:, 2:5])
         if is_y_up and share < 0.5:
             along = f", heads are towards {axis}" if axis else ""
-            text = (
-                f"people are upright in {100 * share:.0f} % of {len(rows)} frames{along}: input_axes is smpl (y up). "
-            )
-            found["axes"] = text + "Where it isn't, set it to frame"
+            text = f"people are upright in {100 * share:.0f} % of {len(rows)} frames{along}: input_axes is smpl (y up)"
+            found["axes"] = f"{text}. Where it isn't, set it to frame"
         return found
 
 

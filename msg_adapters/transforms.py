@@ -233,10 +233,9 @@ class TransformBuffer:
             if not {*ring}.isdisjoint((*up, *down)):
                 raise TransformError(f"frames form a ring, end who sends one of these: {' in '.join((*ring, ring[0]))}")
         if common is None:
-            msg = f"no transform leads from {source or 'a frame without a name'} to {target}"
-            if not self._tracks:
-                msg += f", none has come: start what sends /tf, or set frame_id to {source} if they are the same place"
-            raise TransformError(msg)
+            hint = f", none has come: start what sends /tf, or set frame_id to {source} if they are the same place"
+            what = f"no transform leads from {source or 'a frame without a name'} to {target}"
+            raise TransformError(what + hint * (not self._tracks))
         return up, down
 
     def _way(self, frame: str) -> list[str]:

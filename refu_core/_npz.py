@@ -88,7 +88,11 @@ def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wante
         budget = ArrayBudget()
         for entry in entries.values():
             _check_entry(archive, entry, budget)
-        return {key: _read_entry(archive, entry) for key, entry in entries.items()}
+        found: dict[str, NDArray[Any]] = {}
+        for key, entry in entries.items():
+            with archive.open(entry) as member:
+                found[key] = npy.read_array(member, allow_pickle=False)
+        return found
 
 
 def npz_names(path: Path, *, error: type[RefuError], wanted: str) -> list[str]:
@@ -124,9 +128,8 @@ def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any
         raise ValueError(f"an array of the version {version}, which isn't read")
     shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(head)
     if dtype.hasobject:
-        msg = "an array of objects, which would be a pickle, and isn't read: save plain numbers, of a sparse matrix "
-        msg += "what its toarray() gives"
-        raise ValueError(msg)
+        hint = "save plain numbers, of a sparse matrix what its toarray() gives"
+        raise ValueError(f"an array of objects, which would be a pickle, and isn't read: {hint}")
     wanted, there = dtype.itemsize * math.prod(shape), size - head.tell()
     if wanted != there or min(shape, default=0) < 0:
         raise ValueError(f"an array {shape} of {dtype} takes {wanted} bytes, the file has {there}")
@@ -143,9 +146,3 @@ def _check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: Array
             budget.take(*check_npy(file, entry.file_size))
     except ValueError as cause:
         raise ValueError(f"{entry.filename.removesuffix('.npy')}: {cause}") from cause
-
-
-def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
-    with archive.open(entry) as file:
-        array: NDArray[Any] = npy.read_array(file, allow_pickle=False)
-    return array

@@ -103,11 +103,11 @@ class Connectivity:
         one_way = np.bincount(self.edge_of_corner.ravel(), weights=np.where(end > start, 1.0, -1.0)) != 0
         n_flipped = int(one_way[n_faces == 2].sum())
         if n_open or n_crowded or n_flipped:
-            raise MeshError(
-                f"a signed distance needs a watertight body: {n_open} open edges, {n_crowded} edges of more than two "
-                f"faces and {n_flipped} edges whose two faces face opposite ways; close the mesh and orient its faces "
-                "outward"
+            edges = (
+                f"{n_open} open edges, {n_crowded} edges of more than two faces and {n_flipped} edges whose two faces "
             )
+            fault = f"{edges}face opposite ways; close the mesh and orient its faces outward"
+            raise MeshError(f"a signed distance needs a watertight body: {fault}")
 
     @cached_property
     def across(self) -> NDArray[np.int32]:
@@ -148,9 +148,8 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
         raise MeshError(f"faces must index vertices 0 to {limit - 1}, got {low} to {high}")
     repeated = (array == np.roll(array, 1, axis=1)).any(axis=1)
     if repeated.any():
-        msg = f"every face needs three different vertices; {repeated.sum()} of {len(array)} repeat one, "
-        msg += f"number {int(repeated.argmax())} (from 0) first: leave such faces out"
-        raise MeshError(msg)
+        bad = f"{repeated.sum()} of {len(array)} repeat one, number {int(repeated.argmax())} (from 0) first"
+        raise MeshError(f"every face needs three different vertices; {bad}: leave such faces out")
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
@@ -171,18 +170,14 @@ def rim_of(faces: NDArray[np.int32]) -> NDArray[np.bool_]:
 def as_points(
     name: str, values: Any, n: int | None = None, *, dtype: type[np.floating[Any]] = np.float64
 ) -> NDArray[Any]:
-    """`values` (a tensor, too) as contiguous, finite points of the type `dtype`, shape (n, 3).
-
-    Raises:
-        MeshError: they aren't finite numbers of that shape.
-    """
+    """`values` (a tensor, too) as contiguous, finite points, shape (n, 3). Raises `MeshError` for anything else."""
+    shape = f"the shape ({'N' if n is None else n}, 3)"
     try:
         points = np.ascontiguousarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=dtype)
     except (TypeError, ValueError) as error:
-        msg = f"{name} must be numbers of the shape ({'N' if n is None else n}, 3), got {type(values).__name__}"
-        raise MeshError(msg) from error
+        raise MeshError(f"{name} must be numbers of {shape}, got {type(values).__name__}") from error
     if points.ndim != 2 or points.shape[1] != 3 or (n is not None and len(points) != n):
-        raise MeshError(f"{name} must have the shape ({'N' if n is None else n}, 3), got {points.shape}")
+        raise MeshError(f"{name} must have {shape}, got {points.shape}")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points)).any(axis=1).sum())
         raise MeshError(f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates")

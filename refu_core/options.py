@@ -167,9 +167,8 @@ class PipelineOptions:
             for stem in (f"{kind}-{self.sdf}", *(["dynamics"] if is_dynamic else [])):
                 path = folder / f"{stem}.safetensors"
                 if not path.is_file():
-                    msg = f"no weights of {stem.replace('-', ' ')} for {name}: {path} is missing; "
-                    msg += "train them (refu train)"
-                    raise SettingsError(msg)
+                    what = f"no weights of {stem.replace('-', ' ')} for {name}: {path} is missing"
+                    raise SettingsError(f"{what}; train them (refu train)")
 
     def load(self, **more: Any) -> GarmentPipeline:
         """The pipeline; `more` are other arguments of `GarmentPipeline.load`. Raises `RefuError` as that does."""

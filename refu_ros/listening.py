@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from refu_core import RefuError
-from refu_ros._transport import make_room
+from refu_ros._program import make_room
 
 
 class LiveTopics:

@@ -20,9 +20,8 @@ from refu_core.options import check, fixed
 from refu_core.recordings import Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
-from refu_ros._parameters import declare, listing
 from refu_ros._program import hear, run, spin
-from refu_ros._settings import AXES, require_persons
+from refu_ros._settings import AXES, declare, listing, require_persons
 
 
 @dataclass(frozen=True, kw_only=True)

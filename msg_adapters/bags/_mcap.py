@@ -1,4 +1,4 @@
-"""The records of an MCAP file, taken apart without trusting any of their lengths.
+"""One MCAP file of a bag, taken apart without trusting any of its lengths: its topics, as they are met, and messages.
 
 A record is an opcode, a length and its content; a chunk's content is more records, compressed. Damaged parts
 are reported and left out; what comes before them (and, where the framing holds, after them) is read.
@@ -12,13 +12,18 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO
 
 import zstandard
 
+from msg_adapters.bags._metadata import BETAS_OF, TopicInfo
+from msg_adapters.cdr import Buffer
+from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
 from refu_core._files import open_file
 
@@ -253,3 +258,121 @@ def iter_records(file: BinaryIO) -> Iterator[tuple[int, memoryview, int]]:
         if opcode in (DATA_END, FOOTER):
             return
         at += _RECORD_HEADER.size + length
+
+
+StoredMessage = tuple[TopicInfo, int, int, Buffer]
+"""A message's topic, log time and publish time [ns], and the message."""
+
+
+class _Catalogue:
+    """The schemas and channels of one file, as they are met."""
+
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
+        self._schemas: dict[int, tuple[str, str]] = {}
+        """Type and `ros2msg` text."""
+        self.channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
+        """Schema's number, topic, encoding and metadata, by the channel's number."""
+        self._known: dict[tuple[int, bytes], bytes] = {}
+        self._topics: dict[int, TopicInfo] = {}
+
+    def add(self, opcode: int, content: memoryview) -> None:
+        """Take in a schema or channel record; raises `DamageError`."""
+        if opcode not in (SCHEMA, CHANNEL):
+            return
+        raw = bytes(content)
+        key = opcode, raw[:2]  # its number
+        if self._known.get(key) == raw:  # each chunk may repeat it, and so does the summary
+            return
+        self._budget.spend("bytes of declarations", len(content))
+        fields = Fields(content)
+        number = fields.number(2)
+        if opcode == SCHEMA:
+            name, encoding = fields.string(), fields.string()
+            text = str(fields.take(fields.number(4)), "utf-8", "replace") if encoding == "ros2msg" else ""
+            self._schemas[number] = full_type_name(name), text
+        else:
+            schema, topic, encoding = fields.number(2), fields.string(), fields.string()
+            self.channels[number] = schema, topic, encoding, fields.string_map(self._budget)
+        self._known[key] = raw
+        self._topics.clear()
+
+    def topic(self, number: int) -> TopicInfo | None:
+        """The topic of a channel; None for one that wasn't declared."""
+        if number not in self._topics and number in self.channels:
+            schema, topic, encoding, metadata = self.channels[number]
+            message_type, definition = self._schemas.get(schema, ("", ""))
+            type_hash, betas_of = metadata.get("topic_type_hash", ""), metadata.get(BETAS_OF, "")
+            self._topics[number] = TopicInfo(topic, message_type, encoding, 0, definition, type_hash, betas_of)
+        return self._topics.get(number)
+
+
+class McapFile:
+    """Reads an MCAP file; damaged parts are reported and left out. Raises `BagError` where it can't be read."""
+
+    def __init__(self, path: Path, report: Callable[[DamageError], None]) -> None:
+        self._path, self.report = path, report
+
+    def topics(self, budget: Budget, *, by_reading: bool) -> tuple[list[tuple[TopicInfo, int]], bool]:
+        """The topics with their message counts, and whether these are only claimed by the summary.
+
+        The summary is trusted if it declares every channel that it counts, and not `by_reading`.
+        """
+        catalogue, counts = self._summary(budget)
+        claimed = not by_reading and counts is not None and counts.keys() <= catalogue.channels.keys()
+        if not claimed or counts is None:
+            counts = Counter(channel for channel, *_ in self._all_messages(catalogue, budget))
+        found = ((catalogue.topic(number), counts.get(number, 0)) for number in catalogue.channels)
+        return [(topic, count) for topic, count in found if topic is not None], claimed
+
+    def messages(self, budget: Budget) -> Iterator[StoredMessage]:
+        """The messages in the order they were recorded."""
+        catalogue, _ = self._summary(budget)
+        for channel, log_ns, publish_ns, data in self._all_messages(catalogue, budget):
+            topic = catalogue.topic(channel)
+            if topic is None:
+                self.report(DamageError("a message of the undeclared channel {}", channel))
+            else:
+                yield topic, log_ns, publish_ns, data
+
+    @contextmanager
+    def _opened(self) -> Iterator[BinaryIO]:
+        """The open file; damage ends the `with` block and is reported."""
+        file, _ = open_bag_file(self._path)
+        with file:
+            try:
+                yield file
+            except DamageError as damage:
+                self.report(damage)
+            except OSError as error:
+                raise BagError(f"{self._path}: can't be read: {error.strerror}") from error
+
+    def _summary(self, budget: Budget) -> tuple[_Catalogue, Mapping[int, int] | None]:
+        """The channels that the summary at the file's end declares, and their message counts (None: it gives none)."""
+        catalogue = _Catalogue(budget)
+        counts: dict[int, int] | None = None
+        with self._opened() as file:
+            for opcode, content in read_summary(file):
+                catalogue.add(opcode, content)
+                if opcode == STATISTICS:
+                    counts = parse_message_counts(content)
+        return catalogue, counts
+
+    def _all_messages(self, catalogue: _Catalogue, budget: Budget) -> Iterator[tuple[int, int, int, memoryview]]:
+        with self._opened() as file:
+            for opcode, content, place in iter_records(file):
+                try:
+                    if opcode == CHUNK:
+                        for inner, record in split_records(unpack_chunk(content, budget)):
+                            budget.spend("records")
+                            if inner == MESSAGE:
+                                yield parse_message(record)
+                            else:
+                                catalogue.add(inner, record)
+                    elif opcode == MESSAGE:
+                        yield parse_message(content)
+                    else:
+                        catalogue.add(opcode, content)
+                except DamageError as damage:  # noqa: PERF203 - the next record may be whole
+                    damage.where = f", in the record at byte {place}"
+                    self.report(damage)

@@ -11,8 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from msg_adapters.bags._mcap import MAGIC, WANTED_FILE, Budget, DamageError, open_bag_file
-from msg_adapters.bags._mcap_file import McapFile
+from msg_adapters.bags._mcap import MAGIC, WANTED_FILE, Budget, DamageError, McapFile, open_bag_file
 from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, TopicInfo, read_file_paths
 from msg_adapters.bags._sqlite import MAGIC as SQLITE_MAGIC
 from msg_adapters.bags._sqlite import SqliteFile

@@ -121,9 +121,8 @@ def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str
         raise BagError(f"{reader.path}: no message in this bag{why}")
     chosen = _choose(reader.path, topics, topic, kinds)
     if chosen.encoding != "cdr":
-        raise BagError(
-            f"{reader.path}: {chosen.name} is encoded as {chosen.encoding or 'nothing'}; wanted cdr, as ROS 2 writes it"
-        )
+        what = f"{chosen.name} is encoded as {chosen.encoding or 'nothing'}"
+        raise BagError(f"{reader.path}: {what}; wanted cdr, as ROS 2 writes it")
     decoder = None if of_keypoints else decoder_for(chosen.message_type, definition=chosen.definition or None)
     return SmplBag(reader, chosen, decoder)
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError
-from msg_adapters.bags._mcap_file import StoredMessage
+from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError, StoredMessage
 from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -77,10 +77,7 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if error is None:
-            self.finish()
-            return
-        with suppress(BagError):  # the original error says more
+        with nullcontext() if error is None else suppress(BagError):  # the original error says more
             self.finish()
 
     @property
@@ -132,12 +129,8 @@ class BagWriter:
         if not 0 <= log_time_ns <= MAX_TIME_NS:
             raise BagError(f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}")
         with self._writing():
-            self._writer.add_message(
-                self._channels[topic],
-                data,
-                log_time_ns=log_time_ns,
-                sequence=self._topics[topic].message_count & 0xFFFFFFFF,
-            )
+            sequence = self._topics[topic].message_count & 0xFFFFFFFF
+            self._writer.add_message(self._channels[topic], data, log_time_ns=log_time_ns, sequence=sequence)
         self._topics[topic].message_count += 1
         self._start_ns = min(self._start_ns, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
@@ -160,9 +153,9 @@ class BagWriter:
         """
         if self._finished:
             return
-        start_ns, end_ns = min(self._start_ns, self._end_ns), self._end_ns
-        topics = [*self._topics.values()]
-        text, record = dump_metadata(file_name=self.file_path.name, topics=topics, start_ns=start_ns, end_ns=end_ns)
+        start_ns, topics = min(self._start_ns, self._end_ns), [*self._topics.values()]
+        name, end_ns = self.file_path.name, self._end_ns
+        text, record = dump_metadata(file_name=name, topics=topics, start_ns=start_ns, end_ns=end_ns)
         with self._writing():
             self._writer.add_metadata("rosbag2", {"serialized_metadata": record})
             self._writer.finish()
@@ -230,11 +223,8 @@ class BagWriter:
             own |= {file.name for file in read_file_paths(directory)}
         others = [file.name for file in found if file.name.removesuffix(_PARTIAL) not in own]
         if found and (others or not overwrite):
-            hint = (
-                f"it holds other files than a bag's: {others[0]}"
-                if overwrite
-                else "choose another path, or overwrite it"
-            )
+            foreign = f"it holds other files than a bag's: {others[0]}" if overwrite else ""
+            hint = foreign or "choose another path, or overwrite it"
             raise BagError(f"{directory}: the directory isn't empty; {hint}")
         return [file for file in found if not file.name.endswith(_PARTIAL)]
 

@@ -33,8 +33,7 @@ def parse_layout(definition: str) -> Layout:
     Raises `DecodeError` for a definition that is more than a header and fixed float arrays, or lacks a needed one.
     """
     own = definition.split("\n====", maxsplit=1)[0]
-    lines = [line.split("#", maxsplit=1)[0].strip() for line in own.splitlines()]
-    lines = [line for line in lines if line]
+    lines = [*filter(None, (line.split("#", maxsplit=1)[0].strip() for line in own.splitlines()))]
     with decoding(MESSAGE_TYPE):
         if not lines or not _HEADER.fullmatch(lines[0]):
             raise DecodeError(f"wanted a definition that starts with 'std_msgs/Header header', got {lines[:1]}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -155,11 +156,8 @@ class MarkerArrayEncoder:
         self._columns = SMPL_COLUMNS[axes]
         writer = CdrWriter()
         writer.fields("I", len(meshes))
-        options: dict[str, Any] = {"frame_id": frame_id, "lifetime_ns": lifetime_ns}
-        places = [
-            _write_marker(writer, ns=mesh.ns, color=mesh.color, points=np.zeros((mesh.faces.size, 3)), **options)
-            for mesh in meshes
-        ]
+        write = partial(_write_marker, writer, frame_id=frame_id, lifetime_ns=lifetime_ns)
+        places = [write(ns=one.ns, color=one.color, points=np.zeros((one.faces.size, 3))) for one in meshes]
         blank = writer.to_bytes()
         # float64 storage guarantees the alignment that the views below rely on.
         storage = np.zeros(-(-(_LEAD_BYTES + len(blank)) // 8), np.float64).view(np.uint8)
@@ -195,24 +193,20 @@ class MarkerArrayEncoder:
         stamps = [split_stamp(stamp) for stamp in each]
         if len(stamps) != n:
             raise EncodeError(f"wanted a stamp for all meshes or {n} stamps, got {len(stamps)}")
-        offsets = self._offsets(transl)
+        offsets = np.zeros(3) if transl is None else numbers("transl", transl).astype(np.float64)
+        if offsets.shape not in ((3,), (n, 3)):
+            raise EncodeError(f"wanted a translation of shape (3,) or ({n}, 3), got {offsets.shape}")
+        offsets = np.broadcast_to(offsets, (n, 3))
         for i, slot in enumerate(self._slots):
             struct.pack_into("<iI", self._payload, slot.stamp_at, *stamps[i])
             self._write_points(slot, numbers(slot.mesh.ns, vertices[i]), offsets[i])
         return self._message.tobytes()
 
-    def _offsets(self, transl: ArrayLike | None) -> NDArray[np.float64]:
-        offsets = np.zeros(3) if transl is None else numbers("transl", transl).astype(np.float64)
-        if offsets.shape not in ((3,), (len(self._slots), 3)):
-            raise EncodeError(f"wanted a translation of shape (3,) or ({len(self._slots)}, 3), got {offsets.shape}")
-        return np.broadcast_to(offsets, (len(self._slots), 3))
-
     def _write_points(self, slot: _Slot, vertices: NDArray[Any], offset: NDArray[np.float64]) -> None:
         mesh = slot.mesh
         if vertices.shape != (mesh.n_vertices, 3) or vertices.dtype not in (np.float32, np.float64):
-            msg = f"{mesh.ns}: wanted vertices ({mesh.n_vertices}, 3) of float32 or float64, "
-            msg += f"got {vertices.shape} of {vertices.dtype}"
-            raise EncodeError(msg)
+            wanted = f"wanted vertices ({mesh.n_vertices}, 3) of float32 or float64"
+            raise EncodeError(f"{mesh.ns}: {wanted}, got {vertices.shape} of {vertices.dtype}")
         with np.errstate(invalid="ignore", over="ignore"):
             for out, column in enumerate(self._columns):
                 np.add(vertices[:, column], offset[column], out=slot.placed[:, out], dtype=np.float64)
@@ -242,12 +236,13 @@ def encode_lists(
     """
     writer = CdrWriter()
     writer.fields("I", len(lists))
-    options: dict[str, Any] = {"frame_id": frame_id, "color": color, "kind": kind, "size": size}
-    options["lifetime_ns"] = lifetime_ns
+    write = partial(
+        _write_marker, writer, frame_id=frame_id, color=color, kind=kind, size=size, lifetime_ns=lifetime_ns
+    )
     for ns, stamp_ns, pose, points in lists:
         if not np.isfinite(pose).all():
             raise EncodeError(f"{ns}: wanted a finite pose, got {pose}")
-        _write_marker(writer, ns=ns, stamp_ns=stamp_ns, points=finite_points(ns, points), pose=pose, **options)
+        write(ns=ns, stamp_ns=stamp_ns, points=finite_points(ns, points), pose=pose)
     return writer.to_bytes()
 
 

@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
-from refu_core.keypoints._guess import first_pose
 from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
-from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
-from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, Solver
+from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, Solver, TrackerSettings, first_pose
 
 Array = NDArray[np.float64]
+
+DEFAULTS = TrackerSettings()
 
 
 class _Seen(NamedTuple):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content, Key, entries
-from refu_core.recordings._mhr import is_of_mhr
+from refu_core.recordings._followed import is_of_mhr
 from refu_core.recordings._rotations import is_one_frame
 from refu_core.recordings._tables import told_apart
 from refu_core.recordings._tracks import frames_of

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from refu_core.recordings._mhr import N_KEYPOINTS
+from refu_core.recordings._followed import N_KEYPOINTS
 from refu_core.recordings._rotations import BODY, WHOLE
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")

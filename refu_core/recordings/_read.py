@@ -16,8 +16,7 @@ from refu_core.recordings import _layouts as table
 from refu_core.recordings._bvh import read_bvh
 from refu_core.recordings._containers import Content, Key, open_content
 from refu_core.recordings._find import chosen, find_motion, first, person_of, with_known_names
-from refu_core.recordings._followed import SMPL_POINTS, are_places, follow, metres_of
-from refu_core.recordings._mhr import POINTS, places_of_mhr
+from refu_core.recordings._followed import MHR_POINTS, SMPL_POINTS, are_places, follow, metres_of, places_of_mhr
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, not_finite, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
@@ -124,7 +123,7 @@ def _recording(
         notes.append("MHR, another body than SMPL's: followed by its keypoints")
         at = places_in_time(numbers(len(array)), len(array), notes)
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
-        return follow(POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
+        return follow(MHR_POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
     if layout.holds_places or _is_of_places(arrays):
         ((name, array),) = arrays.items()
         notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
