@@ -116,12 +116,10 @@ class PickledArrays:
             if not len(numbers) == len(first) == len(second):
                 msg = f"a sparse matrix of {len(numbers)} numbers in {len(first)} rows and {len(second)} columns"
                 raise ValueError(msg)
-            listed: NDArray[Any] = coo_array((numbers, (first, second)), shape=(rows, columns)).toarray()
-            return listed
+            return coo_array((numbers, (first, second)), shape=(rows, columns)).toarray()
         matrix = (csc_array if kind == "csc" else csr_array)((numbers, first, second), shape=(rows, columns))
         matrix.check_format(full_check=True)
-        dense: NDArray[Any] = matrix.toarray()
-        return dense
+        return matrix.toarray()
 
 
 def _coordinates(state: dict[str, Any]) -> list[Any]:

@@ -257,8 +257,7 @@ def exactly(kind: type[Any], value: Any) -> Any:
 
 def bytes_of(value: Any) -> bytes:
     """Bytes, which Python 3 writes as text in protocol 2; converted only on request, as many may share one text."""
-    encoded: bytes = value.encode("latin1") if type(value) is str else exactly(bytes, value)
-    return encoded
+    return value.encode("latin1") if type(value) is str else exactly(bytes, value)
 
 
 def dtype_of(record: Record) -> np.dtype[Any]:

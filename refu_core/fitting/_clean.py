@@ -55,8 +55,7 @@ def components(faces: Ints, n: int) -> tuple[int, Ints]:
 
 def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
     """Normals of faces, twice their area long, shape (F, 3)."""
-    found: NDArray[np.float64] = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-    return found
+    return np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
 
 
 def rim_vertices(f: Ints) -> Ints:
@@ -128,8 +127,7 @@ def _split(f: Ints, middle: Ints) -> Ints:
         add(three, *(corner[three] for corner in corners))
     found = np.concatenate(parts)
     # Sorted by face and by part, so that UVs, which are split separately, come out in the same order.
-    result: Ints = found[np.lexsort((found[:, 1], found[:, 0])), 2:]
-    return result
+    return found[np.lexsort((found[:, 1], found[:, 0])), 2:]
 
 
 def _edges(f: Ints) -> tuple[Ints, Ints]:
@@ -159,8 +157,7 @@ def _groups_of_place(v: NDArray[np.float64], extent: float) -> Ints:
     pairs = cKDTree(v[first]).query_pairs(_SAME_PLACE * extent, output_type="ndarray")
     label = linked(pairs, len(first))[1][of_cell.ravel()]
     _, first, of_group = np.unique(label, return_index=True, return_inverse=True)
-    found: Ints = first[of_group].astype(np.int64)
-    return found
+    return first[of_group].astype(np.int64)
 
 
 def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:

@@ -268,8 +268,7 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
 def _shapedirs(body: SmplBody) -> F64:
     """Displacements of the body's vertices per unit of each beta [m], shape (N, 30)."""
     shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template
-    found: F64 = shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
-    return found
+    return shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
 
 
 def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
@@ -294,8 +293,7 @@ def _unposed(mesh: SurfaceMesh, posed: PosedBody) -> F64:
     weights = torch.from_numpy(_few(transfer(posed.body.weights.double().numpy(), length=_SKIN_LENGTH)))
     transforms = type(posed.transforms)(*(part.double() for part in posed.transforms))
     points = torch.from_numpy(mesh.vertices)[None]
-    found: F64 = unapply_transforms(points, blend_transforms(weights, transforms))[0].numpy()
-    return found
+    return unapply_transforms(points, blend_transforms(weights, transforms))[0].numpy()
 
 
 def _few(weights: F64) -> F64:

@@ -70,8 +70,7 @@ class Proportions:
 
     def of(self, betas: Array) -> Array:
         """Joints in the T-pose [m], shape (24, 3), for betas (10,)."""
-        joints: Array = self.joints + self.shapedirs @ betas
-        return joints
+        return self.joints + self.shapedirs @ betas
 
 
 class Posed(NamedTuple):
@@ -127,8 +126,7 @@ class Skeleton:
 
     def bones(self, betas: Array) -> Array:
         """The vector from each joint's parent to it in the T-pose [m], shape (24, 3)."""
-        bones: Array = self._bones[:, :, 0] + self._bones[:, :, 1:] @ betas
-        return bones
+        return self._bones[:, :, 0] + self._bones[:, :, 1:] @ betas
 
     def posed(self, pose: Pose) -> Posed:
         """Joints and keypoints of a pose; those of the last pose are remembered."""
@@ -164,8 +162,7 @@ class Skeleton:
 
 def exp_so3(vectors: Array) -> Array:
     """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) [rad]."""
-    matrices: Array = Rotation.from_rotvec(vectors).as_matrix()
-    return matrices
+    return Rotation.from_rotvec(vectors).as_matrix()
 
 
 def log_so3(matrices: Array) -> Array:

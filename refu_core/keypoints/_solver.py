@@ -283,8 +283,7 @@ def _turn_above(turns: Array, joint: int) -> Array:
 
 
 def _unit(vector: Array) -> Array:
-    unit: Array = vector / max(float(np.linalg.norm(vector)), 1e-9)
-    return unit
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def _shortest(start: Array, end: Array) -> Array:
