@@ -78,7 +78,8 @@ def read_bvh(
 def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     """The joints, one row of channels per frame, and the seconds between frames. Raises `ValueError`."""
     hierarchy, word, motion = text.partition("MOTION")
-    hierarchy = re.sub(r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)", _one_word, hierarchy)
+    names = r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)"
+    hierarchy = re.sub(names, lambda match: match[1] + re.sub(r"\s+", "_", match[2]), hierarchy)
     head = re.match(r"\s*Frames:\s*(\d+)\s+Frame\s+Time:\s*([-+.\deE]+)", motion) if word else None
     if head is None:
         raise ValueError("not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:")
@@ -90,10 +91,6 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
         msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
         raise ValueError(msg)
     return joints, numbers.reshape(count, n_channels), float(head[2])
-
-
-def _one_word(match: re.Match[str]) -> str:
-    return match[1] + re.sub(r"\s+", "_", match[2])
 
 
 def _joints(words: Iterator[str]) -> list[_Joint]:
@@ -180,10 +177,8 @@ def _points(joints: list[_Joint], places: Array) -> dict[str, int]:
     for part, names in _NAMES.items():
         for side in ("l", "r") if part in _SIDED else ("",):
             taken = points.values()
-            found = next(
-                (at for name in names if (at := sides.get((side, name))) is not None and at not in taken), None
-            )
-            if found is not None:
+            named = (sides.get((side, name)) for name in names)
+            if (found := next((at for at in named if at is not None and at not in taken), None)) is not None:
                 points[f"{side}_{part}" if side else part] = found
     if "pelvis" not in points and (pelvis := _between(joints, places, points)) is not None:
         points["pelvis"] = pelvis

@@ -22,16 +22,8 @@ from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz, 
 from refu_core._pickle import PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, bytes_of, read_stream
 from refu_core.errors import RefuError
-from refu_core.recordings._layouts import (
-    ALL_KEYS,
-    GENDERS,
-    JSON_ADVICE,
-    POSE_KEYS,
-    SUFFIXES,
-    WANTED,
-    is_like_column,
-    is_like_known,
-)
+from refu_core.recordings import _layouts as table
+from refu_core.recordings._layouts import WANTED
 
 Key = str | int
 _ZIP, _NPY = b"PK\x03\x04", b"\x93NUMPY"
@@ -120,10 +112,6 @@ class Content:
             if len(path) < MOST_DEPTH and len(todo) < _MOST_NODES:
                 todo += [((*path, key), item) for key, item in inside.items() if entries(item) is not None]
 
-    def renamed(self, names: Mapping[Key, Key]) -> Content:
-        """The same content with keys renamed, wherever they occur."""
-        return self.changed(lambda node: {names.get(key, key): item for key, item in node.items()})
-
     def changed(self, change: Callable[[Mapping[Key, Any]], Mapping[Key, Any]]) -> Content:
         """The same content with every mapping changed, and then the mappings in it; a shared one is changed once."""
         made: dict[int, Any] = {}
@@ -207,20 +195,20 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
                 return Content(root, storage)
             return Content(root)
         except DAMAGE as cause:
-            is_other = path.suffix and path.suffix.lower() not in SUFFIXES
+            is_other = path.suffix and path.suffix.lower() not in table.SUFFIXES
             why = f"no file of motion is a {path.suffix}" if is_other else told(cause)
-            hint = JSON_ADVICE if path.suffix.lower() == ".json" else ""
+            hint = table.JSON_ADVICE if path.suffix.lower() == ".json" else ""
             raise error(f"{path}: can't be read: {why}; wanted {WANTED}{hint}") from cause
 
 
 def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
-    wanted = {name for name in names if _steps(name)[-1] in ALL_KEYS}
-    if not any(_steps(name)[-1] in POSE_KEYS for name in names):
+    wanted = {name for name in names if _steps(name)[-1] in table.ALL_KEYS}
+    if not any(_steps(name)[-1] in table.POSE_KEYS for name in names):
         for name in names:  # a dictionary that NumPy has pickled into an array
             held = _object(path, name)
             if held is not None:
                 return Content({**_arrays(path, wanted, error), name: held})
-        wanted |= {name for name in names if is_like_known(_steps(name)[-1])}
+        wanted |= {name for name in names if table.spelled(_steps(name)[-1]).endswith(table.KNOWN_WORDS)}
     arrays = _arrays(path, wanted, error)
     root: dict[Key, Any] = dict.fromkeys(name for name in names if name not in arrays)
     for name, array in arrays.items():
@@ -235,10 +223,10 @@ def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
 
 def _arrays(path: Path, names: set[str], error: type[RefuError]) -> dict[str, NDArray[Any]]:
     """The arrays of these names; of those named like columns, only what is one. Raises `error` for damaged ones."""
-    like = {name for name in names if is_like_column(_steps(name)[-1])}
+    like = {name for name in names if table.spelled(_steps(name)[-1]).endswith(table.COLUMN_WORDS)}
     columns = _columns(path, like, error)
     # A gender that isn't one mustn't be overlooked.
-    apart = {name for name in like if name in columns or _steps(name)[-1] not in GENDERS}
+    apart = {name for name in like if name in columns or _steps(name)[-1] not in table.GENDERS}
     return read_npz(path, keys=names - apart, error=error, wanted=WANTED) | columns
 
 

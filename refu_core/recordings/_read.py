@@ -52,8 +52,8 @@ def read_recording(
         worn: the body that will be dressed: betas are fitted to it if the file has only places of joints, and roots
             turn about its pelvis. By default a built-in body.
 
-    Raises:
-        error: the file can't be read, isn't recognised, has no frame rate, or its arrays have wrong shapes or meanings.
+    Raises `error`: the file can't be read, isn't recognised, has no frame rate, or its arrays have wrong shapes or
+    meanings.
     """
     path = Path(path)
     if axes not in AXES or not isinstance(fps, (int, float, type(None))):
@@ -167,9 +167,8 @@ def _recording(
     tell_pace(transl, hertz, notes)
     bad = not_finite(poses, transl)
     if len(bad):
-        notes.append(
-            f"NaN or infinite in {len(bad)} of {len(poses)}, first in number {bad[0]}: nobody is dressed there"
-        )
+        where = f"{len(bad)} of {len(poses)}, first in number {bad[0]}"
+        notes.append(f"NaN or infinite in {where}: nobody is dressed there")
     gender = gender_of(word_of(content, first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, hertz, gender, tuple(notes))
