@@ -55,7 +55,7 @@ def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
         got = _fault(Path(path).stat(), most)
         if not got:
             # Another file may have taken its place by now, so the opened one is checked again; opening it can't block.
-            raw = io.FileIO(path, opener=_without_waiting)
+            raw = io.FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK | os.O_NOCTTY))
             found = os.fstat(raw.fileno())
             got = _fault(found, most)
             if not got:
@@ -143,10 +143,6 @@ def _finite(text: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{text[:40]} where a finite number was expected")
     return number
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
 
 
 def _fault(found: os.stat_result, most: int) -> str:

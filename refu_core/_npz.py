@@ -74,8 +74,7 @@ class ArrayBudget:
 def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` that are named in `keys`, as far as it has them: numbers or text.
 
-    Raises:
-        error: the file can't be read, holds anything else under one of the keys, or holds more than `MAX_BYTES`.
+    Raises `error`: the file can't be read, holds anything else under one of the keys, or holds more than `MAX_BYTES`.
     """
     with _archive(path, error, wanted) as archive:
         names = {entry: entry.filename.removesuffix(".npy") for entry in archive.infolist()}
@@ -113,13 +112,9 @@ def _archive(path: Path, error: type[RefuError], wanted: str) -> Iterator[zipfil
 
 
 def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Checks that a file of `size` bytes, read from its start, holds the array that its header announces.
+    """The shape and type of the array in a file of `size` bytes, if the file holds what its header announces.
 
     Numpy allocates what a header announces before it looks for it, and lengthens a file that it maps for writing.
-
-    Returns:
-        The array's shape and type.
-
     Raises `ValueError`, and whatever else numpy raises on damaged headers.
     """
     head = io.BytesIO(file.read(_MAX_HEADER_BYTES))

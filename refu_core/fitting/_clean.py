@@ -63,15 +63,15 @@ def rim_vertices(f: Ints) -> Ints:
     return np.unique(Connectivity.of(f).boundary).astype(np.int64)
 
 
-def is_ball(f: Ints) -> bool:
-    """Whether the largest piece is closed and no hole goes through it: no limb can. Cloth with two sides has holes."""
+def no_opening(f: Ints) -> str:
+    """A hint if the largest piece is closed and no hole goes through it: no limb can. Two-sided cloth has holes."""
     used, f = np.unique(f, return_inverse=True)
     f = f.reshape(-1, 3)
     _, label = components(f, len(used))
     largest = int(np.bincount(label).argmax())
     f = f[label[f[:, 0]] == largest]
     euler = int((label == largest).sum()) - len(_edges(f)[0]) + len(f)
-    return euler == 2
+    return ". It has no opening: if faces close its neck, sleeves, legs or hem, delete those" if euler == 2 else ""
 
 
 def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:

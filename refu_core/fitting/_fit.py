@@ -17,13 +17,13 @@ from refu_core.fitting._clean import (
     clean,
     components,
     face_normals,
-    is_ball,
+    no_opening,
     split_long_edges,
     turned_over,
 )
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._pieces import apart, unsewn, without_bodies, without_floor
-from refu_core.fitting._place import NO_OPENING, UNITS, Place, Placing, find_places
+from refu_core.fitting._place import UNITS, Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -103,16 +103,9 @@ def fit_garment(
 ) -> FittedGarment:
     """Makes a garment from a mesh that was made for roughly this body: it can be worn at once, without networks.
 
-    Args:
-        mesh: as `read_surface` reads it.
-        body: one of the built-in bodies, on the CPU.
-        name: the garment's name.
-        placing: what is known about the mesh's unit, axes, place and pose; by default all of it is found out.
-        details: what else is known about the garment.
-        longest_edge: longer edges are split [m].
-
-    Raises:
-        GarmentError: the mesh can't be worn; the message says why, and what to do.
+    The `mesh` is as `read_surface` reads it, the `body` one of the built-in ones, on the CPU. `placing` tells what is
+    known about the mesh's unit, axes, place and pose; by default all of it is found out. Edges longer than
+    `longest_edge` [m] are split. Raises `GarmentError` for a mesh that can't be worn, with why, and what to do.
     """
     require_type(mesh, SurfaceMesh, "a SurfaceMesh, such as read_surface gives", error=GarmentError)
     require_type(body, SmplBody, "an SmplBody, such as load_body gives", error=GarmentError)
@@ -238,7 +231,9 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
     vertices, posed = mesh.vertices, PosedBody(body, np.zeros((N_JOINTS, 3)))
     transfer = Transfer.of(vertices, mesh.faces, posed)
     weights = _few(transfer(body.weights.double().numpy(), length=_SKIN_LENGTH))
-    shapedirs = transfer(_shapedirs(body), length=_SHAPE_LENGTH)
+    shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template  # how a unit of each beta moves the skin [m]
+    of_skin = shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
+    shapedirs = transfer(of_skin, length=_SHAPE_LENGTH)
     share = (transfer.mass @ weights) / transfer.mass.sum()
     at_shoulders = share[list(_SHOULDERS)].sum() > 0.04
     held_at = details.held_at or ("shoulders" if at_shoulders else "waist")
@@ -263,12 +258,6 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
         uv=mesh.uv,
     )
     return FittedGarment(template, notes, worn.warnings)
-
-
-def _shapedirs(body: SmplBody) -> F64:
-    """Displacements of the body's vertices per unit of each beta [m], shape (N, 30)."""
-    shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template
-    return shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
 
 
 def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
@@ -316,12 +305,11 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     deep = float((distance < -_DEEP).mean())
     if deep > _MOST_DEEP:
         near = _near(v[distance < -_DEEP], body)
-        msg = (
+        raise GarmentError(
             f"{100 * deep:.0f} % of the garment is more than {1e3 * _DEEP:.0f} mm inside the body {body.body.name}, "
             f"most of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
+            f"{no_opening(mesh.faces)}"
         )
-        msg += NO_OPENING if is_ball(mesh.faces) else ""
-        raise GarmentError(msg)
     for _ in range(_ROUNDS):
         lift = _shortfall(v, body)
         middles = _shortfall(v[edges].mean(1), body)
@@ -336,12 +324,11 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     moved = np.linalg.norm(v - start, axis=1)
     if (moved > _FARTHEST).mean() > _MOST_FAR or moved.max() > 2 * _FARTHEST:
         near = _near(v[moved > _FARTHEST], body)
-        msg = (
+        raise GarmentError(
             f"to be outside the body {body.body.name} the garment had to move by {1e3 * moved.max():.0f} mm near the "
             f"{near}: it was made for another body or pose; say its --pose or --up, or try another --body"
+            f"{no_opening(mesh.faces)}"
         )
-        msg += NO_OPENING if is_ball(mesh.faces) else ""
-        raise GarmentError(msg)
     if moved.max() > 1e-3:
         notes.append(
             f"{100 * float((moved > 1e-3).mean()):.0f} % of the vertices were brought {1e3 * CLEARANCE:.0f} mm off the "

@@ -63,10 +63,6 @@ class KeypointTracker:
         self._noise = self._settings.noise
         self._swapped_for = self._unfit_for = 0.0
 
-    def _neutral(self) -> Pose:
-        betas = np.zeros(N_BETAS) if self._known is None else self._known
-        return Pose(np.zeros(3), exp_so3(np.where(SPREAD < 10, MEAN, 0.0)), betas)
-
     # A frame --------------------------------------------------------------------------------------
 
     @property
@@ -84,8 +80,7 @@ class KeypointTracker:
             confidence: from 0 to 1, shape (K,); NaN and negative numbers count as 0. In a frame that has one above 2,
                 all are out of 100.
 
-        Raises:
-            FrameError: another number of keypoints, or values that aren't numbers.
+        Raises `FrameError`: another number of keypoints, or values that aren't numbers.
         """
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
@@ -120,16 +115,11 @@ class KeypointTracker:
         coast = self._settings.coast
         ahead = coast * (1 - math.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
         pose = self._pose.moved(ahead * self._rate) if ahead else self._pose
-        betas = self._steady_betas(pose.betas)
+        if self._sent_betas is None or np.abs(pose.betas - self._sent_betas).max() > self._settings.beta_step:
+            self._sent_betas = pose.betas.copy()
+        betas = self._sent_betas
         transl = pose.pelvis - self.skeleton.proportions.of(betas)[0]
-        return SmplFrame(
-            log_so3(pose.turns).astype(np.float32), betas=betas.astype(np.float32), transl=transl, stamp_ns=stamp_ns
-        )
-
-    def _steady_betas(self, betas: Array) -> Array:
-        if self._sent_betas is None or np.abs(betas - self._sent_betas).max() > self._settings.beta_step:
-            self._sent_betas = betas.copy()
-        return self._sent_betas
+        return SmplFrame(log_so3(pose.turns), betas, transl, stamp_ns=stamp_ns)
 
     def _cleaned(self, points: ArrayLike, confidence: ArrayLike | None) -> _Seen:
         n = len(self.skeleton.layout)
@@ -160,10 +150,11 @@ class KeypointTracker:
 
     def _guessed(self, seen: _Seen) -> tuple[Pose, Array, float] | None:
         """The pose, its variances, and how badly it fits [m], from one frame alone, left and right as they fit best."""
-        found = []
-        other = self.skeleton.layout.mirrored
+        found, other = [], self.skeleton.layout.mirrored
+        betas = np.zeros(N_BETAS) if self._known is None else self._known
+        neutral = Pose(np.zeros(3), exp_so3(np.where(SPREAD < 10, MEAN, 0.0)), betas)
         for sides in (seen, _Seen(seen.points[other], seen.weights[other])):
-            pose = first_pose(self.skeleton, sides.points, sides.weights > 0, self._neutral())
+            pose = first_pose(self.skeleton, sides.points, sides.weights > 0, neutral)
             if pose is not None:
                 solved = self._solved(pose, sides, prior=None, rest=1.0, steps=8)
                 found.append((solved.pose, solved.variance, self._misfit(solved.pose, sides)))
@@ -243,16 +234,14 @@ class KeypointTracker:
     def _correct(self, seen: _Seen, dt: float) -> None:
         assert self._pose is not None
         rest = min(1.0, dt / self._settings.rest_after)
-        after, variance, step = self._solved(
-            self._pose, seen, prior=1 / self._variance, rest=rest, steps=self._settings.steps
-        )
+        prior, steps = 1 / self._variance, self._settings.steps
+        after, variance, step = self._solved(self._pose, seen, prior=prior, rest=rest, steps=steps)
         gain = self._mixed / self._variance
         shrunk = 1 - variance / self._variance
         self._rate = np.minimum(np.maximum(self._rate + gain * step, -_FASTEST), _FASTEST)
         self._rate_variance = np.maximum(self._rate_variance - gain * self._mixed * shrunk, 0.0)
         self._mixed = gain * variance
-        self._variance = variance
-        self._pose = after
+        self._variance, self._pose = variance, after
         self._seen_at = self._stamp
         self._learn_noise(seen, dt)
 
