@@ -203,8 +203,7 @@ class TransformBuffer:
 
         If that time's transform hasn't come yet, the newest is used, unless it is older by more than the tolerance.
 
-        Raises:
-            TransformError: no way leads from one to the other, or not at that time, or they hang in a ring.
+        Raises `TransformError`: no way leads from one to the other, or not at that time, or they hang in a ring.
         """
         up, down = self._ways(target, source)
         ends = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from refu_core import RefuError
@@ -27,15 +28,13 @@ class LiveTopics:
             from refu_ros._interfaces import interface
         except ImportError as error:
             raise RefuError(f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})') from error
-        self._take, self._context = take, rclpy.Context()
+        self._context = rclpy.Context()
         try:
             rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             node = rclpy.create_node("refu_view", context=self._context, enable_rosout=False)
             self._node: Any = node
             for topic, kind in topics.items():
-                node.create_subscription(
-                    interface(kind), topic, lambda data, of=topic: self._take(of, data), 1, raw=True
-                )
+                node.create_subscription(interface(kind), topic, partial(take, topic), 1, raw=True)
         except Exception as error:
             self._context.try_shutdown()
             raise RefuError(f"no topics {', '.join(topics)}: {error}") from error

@@ -44,16 +44,9 @@ def encode_collision_object(
 ) -> bytes:
     """A `moveit_msgs/CollisionObject`, as MoveIt's planning scene takes it.
 
-    Args:
-        name: the object's id.
-        stamp_ns: time of the measurement [ns].
-        frame_id: the header's frame.
-        placement: of the object in that frame.
-        mesh: vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3), which replace those of an
-            object of that name; without a mesh the object is removed.
-        subframes: frames of the object, relative to it, by name; MoveIt plans to `<object>/<name>`.
-
-    Raises `EncodeError` for an invalid mesh.
+    `mesh` is vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3), which replace those of an
+    object of this name; without it the object is removed. `placement` is the object's in `frame_id`, `subframes` are
+    relative to the object; MoveIt plans to `<object>/<name>`. Raises `EncodeError` for an invalid mesh.
     """
     writer = CdrWriter()
     frames = subframes or {}

@@ -119,17 +119,15 @@ class Together(Output):
 class Apart(Output):
     """A topic for each person, and for each part of what they wear: nobody needs to be told that one has gone.
 
-    Args:
-        message_type: of the output.
-        places: topics below the person's name, each with an argument for `encode`.
-        encode: makes one message of one person.
-        slow: whether these are planners' meshes, at most `planner_rate` a second; the argument is then the garment.
+    `encode` makes one message of one person.
     """
 
     message_type: str
     places: Callable[[Fittings], Iterable[tuple[str, Any]]]
+    """Topics below the person's name, each with an argument for `encode`."""
     encode: Callable[[DressedPerson, Any, Moment], bytes]
     slow: bool = False
+    """Whether these are planners' meshes, at most `planner_rate` a second; the argument is then the garment."""
     due: dict[str, float] = field(default_factory=dict)
     """When each topic of planners' meshes is due next."""
 
