@@ -21,8 +21,7 @@ from msg_adapters import MESH, encode_mesh
 from msg_adapters.bags import free_path
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_ros._bag_job import BagJob
-from refu_ros._beside import RequestDresser, asked_frame, asked_path, asked_settings
+from refu_ros._beside import BagJob, RequestDresser, asked_frame, asked_path, asked_settings
 from refu_ros._guard import answer_no
 from refu_ros._interfaces import interface
 

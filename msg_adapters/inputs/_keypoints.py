@@ -20,10 +20,7 @@ from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError, decoding
 from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
-KEYPOINT_TYPES: dict[str, str] = {
-    "keypoint_poses": "geometry_msgs/msg/PoseArray",
-    "keypoint_markers": MARKER_ARRAY,
-}
+KEYPOINT_TYPES: dict[str, str] = {"keypoint_poses": "geometry_msgs/msg/PoseArray", "keypoint_markers": MARKER_ARRAY}
 """Message type of each input type that holds keypoints."""
 
 _CUBE, _SPHERE, _ADD = 1, 2, 0

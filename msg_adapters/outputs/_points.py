@@ -109,14 +109,11 @@ class PointCloudEncoder:
 
 def _layout(fields: Sequence[str], *, most_vertices: int) -> np.dtype[Any]:
     """A point's dtype: numbers of four bytes come first, so that all lie at multiples of their size."""
-    columns = [(name, "<f4") for name in "xyz"]
-    if "normal" in fields:
-        columns += [(f"normal_{axis}", "<f4") for axis in "xyz"]
-    columns += [(name, "<f4") for name in ("clearance", "sigma") if name in fields]
-    if "vertex" in fields:
-        columns.append(("vertex", "<u2" if most_vertices <= 1 << 16 else "<u4"))
-    columns += [(name, "u1") for name in ("garment", "visible") if name in fields]
-    return np.dtype(columns, align=True)
+    optional = {f"normal_{axis}": "<f4" for axis in "xyz"} if "normal" in fields else {}
+    kinds = {"clearance": "<f4", "sigma": "<f4", "vertex": "<u2" if most_vertices <= 1 << 16 else "<u4"}
+    kinds |= {"garment": "u1", "visible": "u1"}
+    columns = {**dict.fromkeys("xyz", "<f4"), **optional, **{name: kinds[name] for name in kinds if name in fields}}
+    return np.dtype([*columns.items()], align=True)
 
 
 def _columns(points: NDArray[Any], first: str) -> NDArray[np.float32]:
