@@ -185,19 +185,22 @@ def as_points(
     return points if points.flags.writeable else points.copy()
 
 
+def face_normals(v: NDArray[_Float], f: NDArray[np.integer[Any]]) -> NDArray[_Float]:
+    """Normals of faces (F, 3) of vertices (V, 3), twice their area long, shape (F, 3)."""
+    return np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
+
+
 def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:
     """Unit normals at vertices (V, 3) of faces (F, 3): the area-weighted mean of faces around each, shape (V, 3)."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
     normals = np.zeros_like(vertices)
-    np.add.at(normals, faces, np.cross(b - a, c - a)[:, None])
+    np.add.at(normals, faces, face_normals(vertices, faces)[:, None])
     unit: NDArray[_Float] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     return unit
 
 
 def vertex_areas(vertices: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
     """A third of the area of the faces (F, 3) around each of the vertices (V, 3) [m²], shape (V,)."""
-    a, b, c = vertices[faces].astype(np.float64).transpose(1, 0, 2)
-    third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    third = np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1) / 6
     return np.bincount(faces.ravel(), np.repeat(third, 3), len(vertices)).astype(np.float64)
 
 

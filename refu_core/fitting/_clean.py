@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from refu_core.errors import GarmentError
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.garments import UvMap
-from refu_core.mesh import Connectivity, linked
+from refu_core.mesh import Connectivity, face_normals, linked
 
 Ints = NDArray[np.int64]
 
@@ -51,11 +51,6 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
 def components(faces: Ints, n: int) -> tuple[int, Ints]:
     """The number of pieces, and the piece of each of the n vertices."""
     return linked(np.concatenate((faces[:, :2], faces[:, 1:])), n)
-
-
-def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
-    """Normals of faces, twice their area long, shape (F, 3)."""
-    return np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
 
 
 def rim_vertices(f: Ints) -> Ints:
@@ -102,32 +97,18 @@ def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
         mesh = SurfaceMesh(new_v, faces, uv)
 
 
+_CUTS = ("012", "032 312", "140 420", "314 034 042", "251 501", "503 253 231", "425 145 150", "035 314 542 345")
+"""Triangles that a face becomes by which of its edges (0, 1), (1, 2), (2, 0) are cut, as bits: corners are 0 to 2, cuts
+3 to 5."""
+
+
 def _split(f: Ints, middle: Ints) -> Ints:
     """Triangles, in order, of faces (F, 3) cut at `middle`: vertices on edges (0, 1), (1, 2), (2, 0), -1 for none."""
-    count = (middle >= 0).sum(1)
-    parts = [np.empty((0, 5), np.int64)]
-    rows = np.arange(len(f))
-
-    def add(which: NDArray[np.intp], *corners: Ints) -> None:
-        parts.append(np.stack((rows[which], np.full(len(which), len(parts)), *corners), 1))
-
-    add(np.flatnonzero(count == 0), *f[count == 0].T)
-    for k in range(3):
-        (a, b, c), (ab, bc, ca) = np.roll(f, -k, 1).T, np.roll(middle, -k, 1).T
-        one = np.flatnonzero((count == 1) & (ab >= 0))
-        add(one, a[one], ab[one], c[one])
-        add(one, ab[one], b[one], c[one])
-        two = np.flatnonzero((count == 2) & (ca < 0))
-        add(two, ab[two], b[two], bc[two])
-        add(two, a[two], ab[two], bc[two])
-        add(two, a[two], bc[two], c[two])
-    (a, b, c), (ab, bc, ca) = f.T, middle.T
-    three = np.flatnonzero(count == 3)
-    for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
-        add(three, *(corner[three] for corner in corners))
-    found = np.concatenate(parts)
-    # Sorted by face and by part, so that UVs, which are split separately, come out in the same order.
-    return found[np.lexsort((found[:, 1], found[:, 0])), 2:]
+    places, cut = np.concatenate((f, middle), 1), (middle >= 0) @ [1, 2, 4]
+    parts = [(np.flatnonzero(cut == k), [*map(int, part)]) for k, parts in enumerate(_CUTS) for part in parts.split()]
+    triangles = np.concatenate([places[rows][:, corners] for rows, corners in parts])
+    # By face, and then as listed, so that UVs, which are split separately, come out in the same order.
+    return triangles[np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")]
 
 
 def _edges(f: Ints) -> tuple[Ints, Ints]:

@@ -12,15 +12,7 @@ from numpy.typing import NDArray
 
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError, require_type
-from refu_core.fitting._clean import (
-    MAX_VERTICES,
-    clean,
-    components,
-    face_normals,
-    no_opening,
-    split_long_edges,
-    turned_over,
-)
+from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._pieces import apart, unsewn, without_bodies, without_floor
 from refu_core.fitting._place import UNITS, Place, Placing, find_places
@@ -28,7 +20,7 @@ from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentCard, GarmentTemplate, require_name
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, face_normals
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]

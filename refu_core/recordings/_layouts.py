@@ -58,11 +58,7 @@ class Layout:
 
 
 MHR = Layout(
-    writers="SAM 3D Body",
-    pose=("pred_keypoints_3d",),
-    transl=("pred_cam_t",),
-    is_whole=False,
-    counts=(N_KEYPOINTS,),
+    writers="SAM 3D Body", pose=("pred_keypoints_3d",), transl=("pred_cam_t",), is_whole=False, counts=(N_KEYPOINTS,)
 )
 """Its keypoints, relative to the body, and where the body is in front of the camera [m]."""
 
@@ -83,11 +79,7 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="EMDB", pose=("poses_root", "poses_body")),
     Layout(writers="AIST++", pose=("smpl_poses",), transl=("smpl_trans",)),
     Layout(
-        writers="ROMP, BEV, TRACE",
-        pose=("smpl_thetas",),
-        transl=("cam_trans",),
-        betas=("smpl_betas",),
-        has_age=True,
+        writers="ROMP, BEV, TRACE", pose=("smpl_thetas",), transl=("cam_trans",), betas=("smpl_betas",), has_age=True
     ),
     Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",)),
     Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",)),
