@@ -57,7 +57,7 @@ class KeypointTracker:
 
     def reset(self) -> None:
         """Forgets the person."""
-        self._pose: Pose | None = None
+        self._is_here = False
         self._sent_betas: Array | None = None
         self._stamp = self._seen_at = 0
         self._noise = self._settings.noise
@@ -85,9 +85,9 @@ class KeypointTracker:
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
         dt = 1e-9 * (stamp_ns - self._stamp)
-        if self._pose is not None and not -1.0 < dt <= 1.0:
+        if self._is_here and not -1.0 < dt <= 1.0:
             self.reset()
-        if self._pose is None:
+        if not self._is_here:
             return self._begin(seen, stamp_ns)
         if dt <= 0:
             return self.at(self._stamp)
@@ -110,7 +110,7 @@ class KeypointTracker:
 
         None if nobody was seen for `hold`.
         """
-        if self._pose is None or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
+        if not self._is_here or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None
         coast = self._settings.coast
         ahead = coast * (1 - math.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
@@ -166,7 +166,7 @@ class KeypointTracker:
         return found[1] if len(found) == 2 and found[1][2] < 0.5 * found[0][2] else found[0]
 
     def _take(self, pose: Pose, variance: Array, _: float) -> None:
-        self._pose = pose
+        self._is_here, self._pose = True, pose
         self._rate = np.zeros(N_PARTS)
         self._variance = variance
         self._mixed = np.zeros(N_PARTS)
@@ -175,7 +175,6 @@ class KeypointTracker:
 
     def _begin_again(self, seen: _Seen) -> None:
         """Starts again from this frame alone if that fits better, once the pose hasn't fitted for long."""
-        assert self._pose is not None
         self._unfit_for = 0.0
         guess = self._guessed(seen)
         if guess is not None and guess[2] < 0.7 * self._misfit(self._pose, seen):
@@ -191,7 +190,6 @@ class KeypointTracker:
 
         If all keypoints are near where they were expected, nothing is changed.
         """
-        assert self._pose is not None
         expected = self.skeleton.posed(self._pose).points
         off = np.square(seen.points - expected).sum(axis=1)
         visible = seen.weights > 0
@@ -219,7 +217,6 @@ class KeypointTracker:
 
     def _predict(self, dt: float) -> None:
         """Moves the pose on by rates that die away, and the variances with it."""
-        assert self._pose is not None
         own = self._settings
         keep = math.exp(-dt / own.coast)
         ahead = own.coast * (1 - keep)
@@ -232,7 +229,6 @@ class KeypointTracker:
         self._rate = keep * self._rate
 
     def _correct(self, seen: _Seen, dt: float) -> None:
-        assert self._pose is not None
         rest = min(1.0, dt / self._settings.rest_after)
         prior, steps = 1 / self._variance, self._settings.steps
         after, variance, step = self._solved(self._pose, seen, prior=prior, rest=rest, steps=steps)
@@ -247,7 +243,6 @@ class KeypointTracker:
 
     def _learn_noise(self, seen: _Seen, dt: float) -> None:
         """Adapts to the tracker's noise, by the median distance that is left after the fit."""
-        assert self._pose is not None
         off = self.skeleton.posed(self._pose).points - seen.points
         squared = np.sort(np.einsum("ki,ki->k", off, off)[seen.weights > 0])
         if len(squared) < 4:
