@@ -46,8 +46,6 @@ from msg_adapters.markers import MarkerMesh as MarkerMesh
 from msg_adapters.markers import decode_marker_array as decode_marker_array
 from msg_adapters.markers import garment_namespace as garment_namespace
 from msg_adapters.markers import vertices_from_points as vertices_from_points
-from msg_adapters.message_filter import Held as Held
-from msg_adapters.message_filter import MessageFilter as MessageFilter
 from msg_adapters.motion import Motion as Motion
 from msg_adapters.motion import load_motion as load_motion
 from msg_adapters.motion import read_motion as read_motion
@@ -62,6 +60,8 @@ from msg_adapters.people import Track as Track
 from msg_adapters.people import check_plausible as check_plausible
 from msg_adapters.people import check_stamp as check_stamp
 from msg_adapters.people import decode_ids as decode_ids
+from msg_adapters.scene import Held as Held
+from msg_adapters.scene import MessageFilter as MessageFilter
 from msg_adapters.transforms import TF_MESSAGE as TF_MESSAGE
 from msg_adapters.transforms import Placement as Placement
 from msg_adapters.transforms import TransformBuffer as TransformBuffer

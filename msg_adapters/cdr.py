@@ -35,8 +35,7 @@ class CdrReader:
             msg = f"wanted a CDR message with a header of {HEADER_BYTES} bytes, got {len(self._data)} bytes"
             raise DecodeError(msg)
         if self._data[0] != 0 or self._data[1] not in _BYTE_ORDERS:
-            msg = f"wanted a plain CDR header (00 00 or 00 01), got {self._data[:2].hex(' ')}"
-            raise DecodeError(msg)
+            raise DecodeError(f"wanted a plain CDR header (00 00 or 00 01), got {self._data[:2].hex(' ')}")
         self._order = _BYTE_ORDERS[self._data[1]]
         self._at = HEADER_BYTES
 
@@ -96,10 +95,9 @@ class CdrReader:
         """Length of a sequence whose items take at least `item_bytes` each."""
         (count,) = self.fields("I")
         if count * item_bytes > self.remaining:
-            msg = (
+            raise DecodeError(
                 f"a sequence claims {count} items of at least {item_bytes} bytes, the message has {self.remaining} left"
             )
-            raise DecodeError(msg)
         return int(count)
 
     def string(self) -> str:
@@ -108,13 +106,11 @@ class CdrReader:
         if not raw:
             return ""  # some senders write an empty string without its NUL
         if raw[-1] != 0:
-            msg = f"wanted a string that ends in NUL, got {bytes(raw[-16:])!r}"
-            raise DecodeError(msg)
+            raise DecodeError(f"wanted a string that ends in NUL, got {bytes(raw[-16:])!r}")
         try:
             return str(raw[:-1], "utf-8")
         except UnicodeDecodeError as error:
-            msg = f"wanted a string in UTF-8, got {bytes(raw[:32])!r}: {error.reason}"
-            raise DecodeError(msg) from None
+            raise DecodeError(f"wanted a string in UTF-8, got {bytes(raw[:32])!r}: {error.reason}") from None
 
     def strings(self) -> list[str]:
         """A sequence of strings."""
@@ -135,8 +131,7 @@ class CdrReader:
     def finish(self) -> None:
         """Check that the message ends here, apart from a few bytes of padding."""
         if self.remaining > _MAX_TRAILING:
-            msg = f"{self.remaining} bytes follow the message's last field; is it of another type?"
-            raise DecodeError(msg)
+            raise DecodeError(f"{self.remaining} bytes follow the message's last field; is it of another type?")
 
 
 class CdrWriter:
@@ -168,8 +163,7 @@ class CdrWriter:
                 try:
                     self._payload += primitive.pack(value)
                 except (struct.error, OverflowError) as error:
-                    msg = f"{value!r} doesn't fit the message's field: {error}"
-                    raise EncodeError(msg) from None
+                    raise EncodeError(f"{value!r} doesn't fit the message's field: {error}") from None
             start = at if start < 0 else start
         return start
 
@@ -178,8 +172,7 @@ class CdrWriter:
         try:
             raw = text.encode() + b"\0"
         except UnicodeEncodeError as error:
-            msg = f"{text!r} can't be written in UTF-8: {error.reason}"
-            raise EncodeError(msg) from None
+            raise EncodeError(f"{text!r} can't be written in UTF-8: {error.reason}") from None
         at = self.fields("I", len(raw))
         self._payload += raw
         return at

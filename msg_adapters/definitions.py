@@ -60,8 +60,7 @@ def message_definition(message_type: str) -> MessageDefinition:
     known = _definitions()
     if name not in known or not known[name].type_hash:
         names = ", ".join(full_type_name(one) for one, definition in known.items() if definition.type_hash)
-        msg = f"no definition of {message_type} is built in (there are {names}); give its text as definition"
-        raise BagError(msg)
+        raise BagError(f"no definition of {message_type} is built in (there are {names}); give its text as definition")
     nested: dict[str, None] = {}
     _dependencies(name, nested)
     parts = [known[name].text, *(f"MSG: {one}\n{known[one].text}" for one in nested)]

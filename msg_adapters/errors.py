@@ -41,5 +41,4 @@ def decoding(message_type: str) -> Iterator[None]:
         with np.errstate(invalid="ignore"):  # signalling NaNs warn when they are cast; the frame refuses all NaNs
             yield
     except (DecodeError, FrameError) as error:
-        msg = f"{message_type}: {error}"
-        raise DecodeError(msg) from None
+        raise DecodeError(f"{message_type}: {error}") from None

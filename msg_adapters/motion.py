@@ -58,15 +58,11 @@ class Motion(Recording):
         try:
             count = n_resampled(len(self), self.fps, fps)
         except ValueError as error:
-            msg = f"{self.source}: {error}"
-            raise MotionFileError(msg) from error
+            raise MotionFileError(f"{self.source}: {error}") from error
         bad = not_finite(self.poses, self.transl)
         if bad.size:
-            msg = (
-                f"{self.source}: {bad.size} of {len(self)} frames aren't finite (the first: {bad[0]}); cut them out, "
-                f"or leave the rate at its own {self.fps:g} Hz"
-            )
-            raise MotionFileError(msg)
+            what = f"{bad.size} of {len(self)} frames aren't finite (the first: {bad[0]})"
+            raise MotionFileError(f"{self.source}: {what}; cut them out, or leave the rate at its own {self.fps:g} Hz")
         at = np.minimum(np.arange(count) * (self.fps / fps), len(self) - 1)
         poses, transl = interpolated(self.poses, self.transl, np.arange(len(self)), at)
         return replace(self, poses=poses.astype(np.float32), transl=transl, fps=float(fps))
@@ -88,14 +84,9 @@ def read_motion(
 ) -> Motion:
     """Reads a file of motion: `docs/guide/inputs.md` lists what is recognised.
 
-    Args:
-        path: an .npz, .npy, pickle (also joblib's and torch's) or .bvh. Nothing in a pickle is executed.
-        fps: frames a second, in place of what the file says; must be given where it says nothing.
-        axes: what root orientations and translations are expressed in; `auto` infers it from how people stand, and says
-            so in the motion's `notes`. The motion is in SMPL's axes, except for `frame`, which leaves it as it is.
-        person: whose motion, where the file has several; the one with most frames if not given.
-        worn: the body that will be dressed (`Proportions.of_body`): betas are fitted to it where the file has only
-            joint positions, and roots turn about its pelvis. A built-in body if not given.
+    Arguments are as in `refu_core.recordings.read_recording`. The axes `auto` are inferred from how people stand, which
+    the motion's `notes` say; `worn` is made by `Proportions.of_body`. The motion is in SMPL's axes, except for `frame`,
+    which leaves it as it is.
 
     Raises `MotionFileError` for a file that can't be read or isn't recognised, or whose arrays have other shapes.
     """
@@ -118,8 +109,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
         raise BagError(msg)
     frames = [record.frame for record in iter_smpl_frames(path) if record.frame is not None]
     if not frames:
-        msg = f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why"
-        raise BagError(msg)
+        raise BagError(f"{path}: no frame of its SMPL topic can be decoded; `refu replay {path}` says why")
     steps = np.diff([frame.stamp_ns for frame in frames])
     longest = max(_PAUSE_NS, 3 * float(np.median(np.abs(steps)))) if len(steps) else 0.0
     kept = steps[np.abs(steps) <= longest]  # small steps back are kept, too: they are no pause

@@ -39,16 +39,14 @@ def check_plausible(frame: SmplFrame) -> None:
     ):
         largest = float(np.abs(value).max())
         if largest > limit:
-            msg = f"{name}: wanted magnitudes up to {limit:g}, got {largest:g}"
-            raise FrameError(msg)
+            raise FrameError(f"{name}: wanted magnitudes up to {limit:g}, got {largest:g}")
     check_stamp(frame.stamp_ns)
 
 
 def check_stamp(stamp_ns: int) -> None:
     """Raises `FrameError` for a time [ns] that no message holds, or before the clock's beginning."""
     if not 0 <= stamp_ns < _MAX_STAMP_NS:
-        msg = f"wanted a stamp that fits a ROS time, got {stamp_ns} ns"
-        raise FrameError(msg)
+        raise FrameError(f"wanted a stamp that fits a ROS time, got {stamp_ns} ns")
 
 
 class InputStream:
@@ -100,15 +98,12 @@ class InputStream:
         frames, frame_ids = {}, {}
         people = decode_keypoints(self._input_type, data, n_points)
         if len(people) > MOST_PEOPLE:
-            msg = f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed"
-            raise DecodeError(msg)
+            raise DecodeError(f"{len(people)} people in a message; up to {MOST_PEOPLE} are followed")
         for name, seen in people.items():
             person = "_".join(word for word in (sender, name) if word)
             frame_ids[person] = seen.frame_id
-            own = followed.update(
-                person, seen.points, confidence=seen.confidence, stamp_ns=seen.stamp_ns or now_ns, now_ns=now_ns
-            )
-            if own is not None:
+            times = {"stamp_ns": seen.stamp_ns or now_ns, "now_ns": now_ns}
+            if (own := followed.update(person, seen.points, confidence=seen.confidence, **times)) is not None:
                 frames[person] = own
         return frames, frame_ids
 
@@ -143,14 +138,11 @@ class Track:
         found = {}
         longest, steps = float(np.median(rows[:, 0])), np.diff(rows[:, 1])
         if longest > LONGEST_TURN:
-            text = f"rotation vectors are as long as {longest:.0f} in most frames, wanted radians: degrees?"
-            found["angles"] = text
+            found["angles"] = f"rotation vectors are as long as {longest:.0f} in most frames, wanted radians: degrees?"
         way, told = np.linalg.norm(np.diff(rows[:, 5:], axis=0), axis=1), steps >= _SHORTEST_S
         if told.any() and (pace := float(np.median(way[told] / steps[told]))) > FASTEST:
-            text = (
-                f"people move by {pace:.0f} m/s in most frames: translations in cm or mm? Or two senders on one topic?"
-            )
-            found["pace"] = text
+            why = "translations in cm or mm? Or two senders on one topic?"
+            found["pace"] = f"people move by {pace:.0f} m/s in most frames: {why}"
         if len(steps) and (n_still := int((steps <= 0).sum())) > len(steps) / 2:
             found["stamps"] = f"stamps don't advance in {n_still} of {len(rows)} frames: does the sender's clock run?"
         elif len(steps) and not _SHORTEST_S <= (step := float(np.median(steps))) <= _LONGEST_S:
@@ -158,10 +150,8 @@ class Track:
         share, axis = upright_share(rows[:, 2:5]), axis_of(rows[:, 2:5])
         if is_y_up and share < 0.5:
             along = f", heads are towards {axis}" if axis else ""
-            text = (
-                f"people are upright in {100 * share:.0f} % of {len(rows)} frames{along}: input_axes is smpl (y up). "
-            )
-            found["axes"] = text + "Where it isn't, set it to frame"
+            text = f"people are upright in {100 * share:.0f} % of {len(rows)} frames{along}: input_axes is smpl (y up)"
+            found["axes"] = f"{text}. Where it isn't, set it to frame"
         return found
 
 

@@ -49,8 +49,7 @@ def quaternion_from_matrix(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     try:
         return Rotation.from_matrix(matrix).as_quat(canonical=True)
     except (ValueError, np.linalg.LinAlgError) as error:
-        msg = f"wanted a rotation, got {matrix.tolist()}"
-        raise EncodeError(msg) from error
+        raise EncodeError(f"wanted a rotation, got {matrix.tolist()}") from error
 
 
 def encode_transforms(transforms: Sequence[Transform]) -> bytes:
@@ -124,13 +123,11 @@ class _Track:
         elif after == len(self.stamps):
             lag = stamp_ns - self.stamps[-1]
             if lag > tolerance_ns:
-                msg = f"the newest transform of {child} is {1e-9 * lag:.3f} s older than the input"
-                raise TransformError(msg)
+                raise TransformError(f"the newest transform of {child} is {1e-9 * lag:.3f} s older than the input")
             value, is_late = self.values[-1], True
         elif after == 0:
             lag = self.stamps[0] - stamp_ns
-            msg = f"the oldest transform of {child} is {1e-9 * lag:.3f} s newer than the input"
-            raise TransformError(msg)
+            raise TransformError(f"the oldest transform of {child} is {1e-9 * lag:.3f} s newer than the input")
         else:
             value = _between(self.values[after - 1 : after + 1], self.stamps[after - 1 : after + 1], stamp_ns)
         return Placement(Rotation.from_quat(value[3:]).as_matrix(), value[:3], is_late)
@@ -206,8 +203,7 @@ class TransformBuffer:
 
         If that time's transform hasn't come yet, the newest is used, unless it is older by more than the tolerance.
 
-        Raises:
-            TransformError: no way leads from one to the other, or not at that time, or they hang in a ring.
+        Raises `TransformError`: no way leads from one to the other, or not at that time, or they hang in a ring.
         """
         up, down = self._ways(target, source)
         ends = []
@@ -234,13 +230,11 @@ class TransformBuffer:
         for way in ways:
             ring = self._ring(way)
             if not {*ring}.isdisjoint((*up, *down)):
-                msg = f"frames form a ring, end who sends one of these: {' in '.join((*ring, ring[0]))}"
-                raise TransformError(msg)
+                raise TransformError(f"frames form a ring, end who sends one of these: {' in '.join((*ring, ring[0]))}")
         if common is None:
-            msg = f"no transform leads from {source or 'a frame without a name'} to {target}"
-            if not self._tracks:
-                msg += f", none has come: start what sends /tf, or set frame_id to {source} if they are the same place"
-            raise TransformError(msg)
+            hint = f", none has come: start what sends /tf, or set frame_id to {source} if they are the same place"
+            what = f"no transform leads from {source or 'a frame without a name'} to {target}"
+            raise TransformError(what + hint * (not self._tracks))
         return up, down
 
     def _way(self, frame: str) -> list[str]:

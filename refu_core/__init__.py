@@ -58,22 +58,17 @@ __all__ = [
 ]
 
 _LAZY = {
-    "ApproxSdf": "sdf",
-    "BandSdf": "sdf",
-    "BodySdf": "sdf",
-    "ExactSdf": "sdf",
-    "GarmentPipeline": "realtime",
-    "GarmentTemplate": "garments",
-    "PipelineOutput": "realtime",
-    "PoseHistory": "history",
-    "Refu": "refu",
-    "Resolver": "contact",
-    "SdfSample": "sdf",
-    "SmplBody": "body",
-    "Wearer": "realtime",
-    "dress": "realtime",
-    "load_body": "body",
-    "load_garment": "garments",
+    name: package
+    for package, names in {
+        "body": ("SmplBody", "load_body"),
+        "contact": ("Resolver",),
+        "garments": ("GarmentTemplate", "load_garment"),
+        "history": ("PoseHistory",),
+        "realtime": ("GarmentPipeline", "PipelineOutput", "Wearer", "dress"),
+        "refu": ("Refu",),
+        "sdf": ("ApproxSdf", "BandSdf", "BodySdf", "ExactSdf", "SdfSample"),
+    }.items()
+    for name in names
 }
 """The package that each name is imported from on first use."""
 
@@ -88,8 +83,7 @@ def __getattr__(name: str) -> Any:
         return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
     if name in _packages():
         return import_module(f"{__name__}.{name}")
-    msg = f"module {__name__!r} has no attribute {name!r}"
-    raise AttributeError(msg)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -18,17 +18,13 @@ def checked_device(name: str | torch.device) -> torch.device:
     try:
         device = torch.device(name)
     except (RuntimeError, ValueError, TypeError) as error:
-        msg = f"no device {name!r}: wanted cpu or cuda"
-        raise RefuError(msg) from error
+        raise RefuError(f"no device {name!r}: wanted cpu or cuda") from error
     if device.type not in ("cpu", "cuda"):
-        msg = f"no device {name!r}: wanted cpu or cuda"
-        raise RefuError(msg)
+        raise RefuError(f"no device {name!r}: wanted cpu or cuda")
     if device.type == "cuda" and not torch.cuda.is_available():
-        msg = f"no device {name!r}: this torch build or machine has no CUDA; use cpu"
-        raise RefuError(msg)
+        raise RefuError(f"no device {name!r}: this torch build or machine has no CUDA; use cpu")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        msg = f"no device {name!r}: the last one is cuda:{torch.cuda.device_count() - 1}"
-        raise RefuError(msg)
+        raise RefuError(f"no device {name!r}: the last one is cuda:{torch.cuda.device_count() - 1}")
     return torch.device("cpu") if device.type == "cpu" else device  # there is only one CPU device, whatever its index
 
 

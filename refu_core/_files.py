@@ -55,7 +55,7 @@ def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
         got = _fault(Path(path).stat(), most)
         if not got:
             # Another file may have taken its place by now, so the opened one is checked again; opening it can't block.
-            raw = io.FileIO(path, opener=_without_waiting)
+            raw = io.FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK | os.O_NOCTTY))
             found = os.fstat(raw.fileno())
             got = _fault(found, most)
             if not got:
@@ -63,8 +63,7 @@ def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
             raw.close()
     except (OSError, ValueError) as cause:  # ValueError: a name that no file system takes
         got = getattr(cause, "strerror", None) or str(cause)
-    msg = f"{os.fspath(path)}: can't be read: {got}; wanted {wanted}"
-    raise error(msg)
+    raise error(f"{os.fspath(path)}: can't be read: {got}; wanted {wanted}")
 
 
 def read_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError], wanted: str) -> bytes:
@@ -73,8 +72,7 @@ def read_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
         try:
             return file.read()
         except OSError as cause:
-            msg = f"{os.fspath(path)}: can't be read: {cause.strerror}; wanted {wanted}"
-            raise error(msg) from cause
+            raise error(f"{os.fspath(path)}: can't be read: {cause.strerror}; wanted {wanted}") from cause
 
 
 def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: str) -> Any:
@@ -84,8 +82,7 @@ def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: s
     except (ValueError, RecursionError) as cause:
         if isinstance(cause, error):
             raise
-        msg = f"{os.fspath(path)}: can't be read as JSON: {cause}; wanted {wanted}"
-        raise error(msg) from cause
+        raise error(f"{os.fspath(path)}: can't be read as JSON: {cause}; wanted {wanted}") from cause
 
 
 def parse_json(text: bytes) -> Any:
@@ -144,13 +141,8 @@ def exclusive(path: Path, *, error: RefuError, is_kept: bool = True) -> Iterator
 def _finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
-        msg = f"{text[:40]} where a finite number was expected"
-        raise ValueError(msg)
+        raise ValueError(f"{text[:40]} where a finite number was expected")
     return number
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
 
 
 def _fault(found: os.stat_result, most: int) -> str:

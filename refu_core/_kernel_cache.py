@@ -34,11 +34,8 @@ _loaded: set[tuple[str, str, int | None]] = set()
 def no_cache(reason: OSError) -> RefuError:
     """The error to raise where compiled kernels can't be kept."""
     folder = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH") or "Warp's cache"
-    msg = (
-        f"compiled kernels can't be kept in {folder}: {reason}; make room there and make it writable, "
-        "or set WARP_CACHE_PATH to a folder that is"
-    )
-    return RefuError(msg)
+    hint = "make room there and make it writable, or set WARP_CACHE_PATH to a folder that is"
+    return RefuError(f"compiled kernels can't be kept in {folder}: {reason}; {hint}")
 
 
 def guard() -> None:
@@ -62,8 +59,7 @@ def guard() -> None:
 def _load(module: Any, block_dim: int | None, plain: Callable[[], Any]) -> Any:
     """Loads a module from its compiled files if they are intact, or else builds them anew.
 
-    Raises:
-        RefuError: there is no place for the files, or new ones can't be loaded either.
+    Raises `RefuError`: there is no place for the files, or new ones can't be loaded either.
     """
     cache = Path(wp.config.kernel_cache_dir)
     folder = cache / f"wp_{module.name}_{module.get_module_hash(block_dim).hex()[:7]}"

@@ -57,17 +57,14 @@ class ArrayBudget:
     def take(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         """Raises `ValueError` if an array is too large, has too many axes, or isn't of plain numbers or text."""
         if len(shape) > _MAX_AXES:
-            msg = f"an array of {len(shape)} axes"
-            raise ValueError(msg)
+            raise ValueError(f"an array of {len(shape)} axes")
         # An axis of length 0 doesn't make an array small: code loops over the other axes.
         count = math.prod(max(n, 1) for n in shape)
         is_text = dtype.kind in "US"
         if is_text and count * max(dtype.itemsize, 1) > MAX_TEXT_BYTES:
-            msg = f"an array {shape} of {dtype}, at most {MAX_TEXT_BYTES} bytes of text are read"
-            raise ValueError(msg)
+            raise ValueError(f"an array {shape} of {dtype}, at most {MAX_TEXT_BYTES} bytes of text are read")
         if not is_text and (dtype.kind not in "biuf" or dtype.itemsize > 8):
-            msg = f"an array of {dtype}, wanted plain numbers of at most 64 bits"
-            raise ValueError(msg)
+            raise ValueError(f"an array of {dtype}, wanted plain numbers of at most 64 bits")
         self._left -= count
         if self._left < 0:
             msg = f"an array {shape} takes {count >> 17} MiB as float64, at most {MAX_BYTES >> 20} MiB are read"
@@ -77,23 +74,24 @@ class ArrayBudget:
 def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` that are named in `keys`, as far as it has them: numbers or text.
 
-    Raises:
-        error: the file can't be read, holds anything else under one of the keys, or holds more than `MAX_BYTES`.
+    Raises `error`: the file can't be read, holds anything else under one of the keys, or holds more than `MAX_BYTES`.
     """
     with _archive(path, error, wanted) as archive:
         names = {entry: entry.filename.removesuffix(".npy") for entry in archive.infolist()}
         entries = {name: entry for entry, name in names.items() if name in keys}
         if len(entries) < sum(name in keys for name in names.values()):
-            msg = "it has two arrays of one name"
-            raise ValueError(msg)
+            raise ValueError("it has two arrays of one name")
         size = sum(entry.file_size for entry in entries.values())
         if size > MAX_BYTES:
-            msg = f"unpacks to {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are read"
-            raise ValueError(msg)
+            raise ValueError(f"unpacks to {size >> 20} MiB, at most {MAX_BYTES >> 20} MiB are read")
         budget = ArrayBudget()
         for entry in entries.values():
             _check_entry(archive, entry, budget)
-        return {key: _read_entry(archive, entry) for key, entry in entries.items()}
+        found: dict[str, NDArray[Any]] = {}
+        for key, entry in entries.items():
+            with archive.open(entry) as member:
+                found[key] = npy.read_array(member, allow_pickle=False)
+        return found
 
 
 def npz_names(path: Path, *, error: type[RefuError], wanted: str) -> list[str]:
@@ -110,53 +108,36 @@ def _archive(path: Path, error: type[RefuError], wanted: str) -> Iterator[zipfil
             with zipfile.ZipFile(file) as archive:
                 yield archive
         except DAMAGE as cause:
-            msg = f"{path}: can't be read as .npz: {told(cause)}; wanted {wanted}"
-            raise error(msg) from cause
+            raise error(f"{path}: can't be read as .npz: {told(cause)}; wanted {wanted}") from cause
 
 
 def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Checks that a file of `size` bytes, read from its start, holds the array that its header announces.
+    """The shape and type of the array in a file of `size` bytes, if the file holds what its header announces.
 
     Numpy allocates what a header announces before it looks for it, and lengthens a file that it maps for writing.
-
-    Returns:
-        The array's shape and type.
-
     Raises `ValueError`, and whatever else numpy raises on damaged headers.
     """
     head = io.BytesIO(file.read(_MAX_HEADER_BYTES))
     version = npy.read_magic(head)
     if version not in ((1, 0), (2, 0)):
-        msg = f"an array of the version {version}, which isn't read"
-        raise ValueError(msg)
+        raise ValueError(f"an array of the version {version}, which isn't read")
     shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(head)
     if dtype.hasobject:
-        msg = "an array of objects, which would be a pickle, and isn't read: save plain numbers, of a sparse matrix "
-        msg += "what its toarray() gives"
-        raise ValueError(msg)
+        hint = "save plain numbers, of a sparse matrix what its toarray() gives"
+        raise ValueError(f"an array of objects, which would be a pickle, and isn't read: {hint}")
     wanted, there = dtype.itemsize * math.prod(shape), size - head.tell()
     if wanted != there or min(shape, default=0) < 0:
-        msg = f"an array {shape} of {dtype} takes {wanted} bytes, the file has {there}"
-        raise ValueError(msg)
+        raise ValueError(f"an array {shape} of {dtype} takes {wanted} bytes, the file has {there}")
     return shape, dtype
 
 
 def _check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: ArrayBudget) -> None:
     if entry.compress_type not in _METHODS:
-        msg = f"{entry.filename} is compressed by the method {entry.compress_type}, only deflate is read"
-        raise ValueError(msg)
+        raise ValueError(f"{entry.filename} is compressed by the method {entry.compress_type}, only deflate is read")
     if entry.compress_size > entry.file_size + (entry.file_size >> 8) + 1024:
-        msg = f"{entry.filename} takes {entry.compress_size} bytes packed, and {entry.file_size} unpacked"
-        raise ValueError(msg)
+        raise ValueError(f"{entry.filename} takes {entry.compress_size} bytes packed, and {entry.file_size} unpacked")
     try:
         with archive.open(entry) as file:
             budget.take(*check_npy(file, entry.file_size))
     except ValueError as cause:
-        msg = f"{entry.filename.removesuffix('.npy')}: {cause}"
-        raise ValueError(msg) from cause
-
-
-def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> NDArray[Any]:
-    with archive.open(entry) as file:
-        array: NDArray[Any] = npy.read_array(file, allow_pickle=False)
-    return array
+        raise ValueError(f"{entry.filename.removesuffix('.npy')}: {cause}") from cause

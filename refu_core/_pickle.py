@@ -44,8 +44,7 @@ class PickledArrays:
             if not isinstance(value, Record) or value.kind != "chumpy":
                 break
             if type(value.state) is not dict or "x" not in value.state:
-                msg = "a chumpy expression; save the model again with its values as plain arrays"
-                raise ValueError(msg)
+                raise ValueError("a chumpy expression; save the model again with its values as plain arrays")
             value = value.state["x"]
         if isinstance(value, Record) and value.kind == "parameter" and value.args:
             value = value.args[0]
@@ -68,13 +67,11 @@ class PickledArrays:
             raw, kind, shape, order = record.args
         else:
             if type(record.state) is not tuple or len(record.state) != 5:
-                msg = "an array without content"
-                raise ValueError(msg)
+                raise ValueError("an array without content")
             _, shape, kind, is_fortran, raw = record.state
             order = "F" if is_fortran else "C"
         if not isinstance(kind, Record) or kind.kind != "dtype" or not isinstance(raw, (str, bytes)):
-            msg = "an array of objects"
-            raise ValueError(msg)
+            raise ValueError("an array of objects")
         dtype = dtype_of(kind)
         shape = tuple(operator.index(n) for n in exactly(tuple, shape))
         self._budget.take(shape, dtype)
@@ -90,20 +87,17 @@ class PickledArrays:
         _, name, key = exactly(Record, storage).args[:3]
         kind = exactly(Name, name).kind
         if given is None or not is_plain(kind) or type(key) is not str:
-            msg = "a tensor without its numbers, or of a type that isn't read"
-            raise ValueError(msg)
+            raise ValueError("a tensor without its numbers, or of a type that isn't read")
         shape, strides = (tuple(operator.index(n) for n in exactly(tuple, pair)) for pair in (shape, strides))
         if len(shape) != len(strides) or min((*shape, *strides, operator.index(offset)), default=0) < 0:
-            msg = f"a tensor of the shape {str(shape)[:80]} and the strides {str(strides)[:80]}"
-            raise ValueError(msg)
+            raise ValueError(f"a tensor of the shape {str(shape)[:80]} and the strides {str(strides)[:80]}")
         self._budget.take(shape, np.dtype(kind))
         flat = np.frombuffer(given(key), np.dtype("<" + kind))
         if 0 in shape:
             return np.zeros(shape, kind)
         last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
         if last >= len(flat):
-            msg = f"a tensor that reaches to number {last} of {len(flat)}"
-            raise ValueError(msg)
+            raise ValueError(f"a tensor that reaches to number {last} of {len(flat)}")
         steps = tuple(stride * flat.itemsize for stride in strides)
         view: NDArray[Any] = np.lib.stride_tricks.as_strided(flat[offset:], shape, steps, writeable=False)
         dense: NDArray[Any] = view.copy()
@@ -116,19 +110,16 @@ class PickledArrays:
         data, first, second = (self.of(part).reshape(-1) for part in (state["data"], *places))
         self._budget.take((rows, columns), np.dtype(np.float64))
         if not first.dtype.kind == second.dtype.kind == "i":
-            msg = f"a sparse matrix with places of {first.dtype} and {second.dtype}"
-            raise ValueError(msg)
+            raise ValueError(f"a sparse matrix with places of {first.dtype} and {second.dtype}")
         numbers = data.astype(np.float64)
         if kind == "coo":
             if not len(numbers) == len(first) == len(second):
                 msg = f"a sparse matrix of {len(numbers)} numbers in {len(first)} rows and {len(second)} columns"
                 raise ValueError(msg)
-            listed: NDArray[Any] = coo_array((numbers, (first, second)), shape=(rows, columns)).toarray()
-            return listed
+            return coo_array((numbers, (first, second)), shape=(rows, columns)).toarray()
         matrix = (csc_array if kind == "csc" else csr_array)((numbers, first, second), shape=(rows, columns))
         matrix.check_format(full_check=True)
-        dense: NDArray[Any] = matrix.toarray()
-        return dense
+        return matrix.toarray()
 
 
 def _coordinates(state: dict[str, Any]) -> list[Any]:
@@ -150,8 +141,7 @@ def _streamed(record: Record) -> tuple[Record, Callable[[str], bytes]]:
     """A storage that torch has written as a stream of its own, and the function that returns its bytes."""
     file = io.BytesIO(bytes_of(record.args[0] if record.args else None))
     if Unpickler(file).load() != STREAM_MAGIC:
-        msg = "a tensor whose numbers are no stream of torch"
-        raise ValueError(msg)
+        raise ValueError("a tensor whose numbers are no stream of torch")
     storage, given = read_stream(file)
     return exactly(Record, storage), given
 
@@ -168,17 +158,14 @@ def read_smpl_pickle(
         try:
             content = Unpickler(file).load()
         except DAMAGE as cause:
-            msg = f"{path}: can't be read as an SMPL pickle: {told(cause)}; wanted {wanted}"
-            raise error(msg) from cause
+            raise error(f"{path}: can't be read as an SMPL pickle: {told(cause)}; wanted {wanted}") from cause
     if type(content) is not dict:
-        msg = f"{path}: an SMPL pickle holds a dictionary, this one a {type(content).__name__}"
-        raise error(msg)
+        raise error(f"{path}: an SMPL pickle holds a dictionary, this one a {type(content).__name__}")
     arrays, made = PickledArrays(), {}
     for key in keys:
         if key in content:
             try:
                 made[key] = arrays.of(content[key])
             except DAMAGE as cause:
-                msg = f"{path}: {key} can't be read: {cause}"
-                raise error(msg) from cause
+                raise error(f"{path}: {key} can't be read: {cause}") from cause
     return made

@@ -104,8 +104,7 @@ _KNOWN: dict[int, Any] = {
 
 class _Opcodes(dict[int, Any]):
     def __missing__(self, code: int) -> None:
-        msg = f"it uses the opcode {chr(code)!r}, which no plain data need: refused, nothing was executed"
-        raise ValueError(msg)
+        raise ValueError(f"it uses the opcode {chr(code)!r}, which no plain data need: refused, nothing was executed")
 
 
 class Unpickler(pickle._Unpickler):
@@ -128,16 +127,14 @@ class Unpickler(pickle._Unpickler):
     def _read_counted(self, n: int) -> bytes:
         self._left -= 1
         if self._left < 0:
-            msg = "too many opcodes and values"
-            raise ValueError(msg)
+            raise ValueError("too many opcodes and values")
         return self._read_uncounted(n)
 
     def find_class(self, module: str, name: str) -> Name:
         """A stand-in for what a pickle names."""
         self._n_names += 1
         if self._n_names > _MAX_NAMES:
-            msg = f"it names objects more than {_MAX_NAMES} times"
-            raise ValueError(msg)
+            raise ValueError(f"it names objects more than {_MAX_NAMES} times")
         full = f"{module}.{name}"
         return Name(NAMES.get(full, "foreign"), full[:_LONGEST_NAME])
 
@@ -150,8 +147,7 @@ class Unpickler(pickle._Unpickler):
 
     def _mark(self) -> None:
         if len(self.metastack) == _MAX_MARKS:
-            msg = f"values in each other, {_MAX_MARKS} deep"
-            raise ValueError(msg)
+            raise ValueError(f"values in each other, {_MAX_MARKS} deep")
         _KNOWN[pickle.MARK[0]](self)
 
     def _call(self) -> None:
@@ -188,15 +184,13 @@ class Unpickler(pickle._Unpickler):
         text = self.read(n)
         # Long text is bytes that Python 3 wrote as text; one wider character makes all up to four times as wide.
         if len(text) > _LONG_TEXT and text.translate(None, bytes(range(0xC4))):
-            msg = "a long text that isn't of bytes"
-            raise ValueError(msg)
+            raise ValueError("a long text that isn't of bytes")
         self.append(text.decode("utf-8", "surrogatepass"))
 
     def _line(self) -> None:
         line = self.readline()
         if len(line) > _LONG_TEXT and re.search(rb"\\(?:U|u(?!00))", line):
-            msg = "a long text that isn't of bytes"
-            raise ValueError(msg)
+            raise ValueError("a long text that isn't of bytes")
         self.append(line[:-1].decode("raw-unicode-escape"))
 
     def _array_behind(self, state: dict[str, Any]) -> Any:
@@ -204,15 +198,13 @@ class Unpickler(pickle._Unpickler):
         kind, shape = exactly(Record, state["dtype"]), exactly(tuple, state["shape"])
         if str(kind.args[0] if kind.args else "").startswith("O"):
             if self._nested == _MAX_NESTED:
-                msg = f"arrays of objects, {_MAX_NESTED} deep"
-                raise ValueError(msg)
+                raise ValueError(f"arrays of objects, {_MAX_NESTED} deep")
             return Unpickler(self, nested=self._nested + 1).load()
         if state.get("numpy_array_alignment_bytes") is not None:
             self.read(self.read(1)[0])
         n_bytes = math.prod(exactly(int, n) for n in shape) * dtype_of(kind).itemsize
         if not 0 <= n_bytes <= MAX_PICKLE_BYTES:
-            msg = f"an array of {n_bytes >> 20} MiB"
-            raise ValueError(msg)
+            raise ValueError(f"an array of {n_bytes >> 20} MiB")
         return Record("buffer", (self.read(n_bytes), kind, shape, state.get("order")))
 
     _own: ClassVar[dict[int, Any]] = {
@@ -251,8 +243,7 @@ def read_stream(file: BinaryIO) -> tuple[Any, Callable[[str], bytes]]:
         size = count * unpickler.storages[key].itemsize
         part = file.read(size) if size >= 0 else b""
         if len(part) != size:
-            msg = f"a tensor of {size} bytes that was cut short"
-            raise ValueError(msg)
+            raise ValueError(f"a tensor of {size} bytes that was cut short")
         parts[key] = part
     return root, parts.__getitem__
 
@@ -260,15 +251,13 @@ def read_stream(file: BinaryIO) -> tuple[Any, Callable[[str], bytes]]:
 def exactly(kind: type[Any], value: Any) -> Any:
     """`value`, if it is exactly of this kind; raises `ValueError` if not."""
     if type(value) is not kind:
-        msg = f"{type(value).__name__} where {kind.__name__} was expected"
-        raise ValueError(msg)
+        raise ValueError(f"{type(value).__name__} where {kind.__name__} was expected")
     return value
 
 
 def bytes_of(value: Any) -> bytes:
     """Bytes, which Python 3 writes as text in protocol 2; converted only on request, as many may share one text."""
-    encoded: bytes = value.encode("latin1") if type(value) is str else exactly(bytes, value)
-    return encoded
+    return value.encode("latin1") if type(value) is str else exactly(bytes, value)
 
 
 def dtype_of(record: Record) -> np.dtype[Any]:
@@ -277,8 +266,7 @@ def dtype_of(record: Record) -> np.dtype[Any]:
     order = record.state[1] if type(record.state) is tuple and len(record.state) > 1 else "|"
     code, order = (text.decode("latin1") if type(text) is bytes else text for text in (code, order))
     if not is_plain(code):
-        msg = f"arrays of the type {code[:20] if type(code) is str else type(code).__name__!r} are not read"
-        raise ValueError(msg)
+        raise ValueError(f"arrays of the type {code[:20] if type(code) is str else type(code).__name__!r} are not read")
     return np.dtype(f"{order}{code}" if order in ("<", ">") else code)
 
 

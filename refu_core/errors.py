@@ -39,8 +39,7 @@ def require_type(
 ) -> None:
     """Raises `error`, with what was `wanted` and what came, for a value of another type."""
     if not isinstance(value, kind):
-        msg = f"wanted {wanted}, got {type(value).__name__}"
-        raise error(msg)
+        raise error(f"wanted {wanted}, got {type(value).__name__}")
 
 
 class FrameError(RefuError, ValueError):

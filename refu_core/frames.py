@@ -42,12 +42,10 @@ def checked_numbers(
     try:
         given = np.ma.asanyarray(value) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
         if given.dtype.kind not in "iufO":  # NumPy also turns booleans, text, dates and complex ones into numbers
-            msg = f"values of the type {given.dtype}"
-            raise TypeError(msg)
+            raise TypeError(f"values of the type {given.dtype}")
         array = np.ma.filled(given.astype(np.float64), np.nan)
     except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a tensor that tracks gradients
-        msg = f"{name} must be {shape} numbers, got {type(value).__name__}: {error}"
-        raise FrameError(msg) from error
+        raise FrameError(f"{name} must be {shape} numbers, got {type(value).__name__}: {error}") from error
     size = math.prod(shape)
     if array.size != size or array.shape not in (shape, (size,)):
         wanted = dict.fromkeys((shape, (size,)))
@@ -60,11 +58,9 @@ def checked_numbers(
         msg = f"{name} has {bad} value{'s' if bad > 1 else ''} that {'are' if bad > 1 else 'is'} NaN or infinite"
         raise FrameError(msg)
     if largest > float(np.finfo(dtype).max):
-        msg = f"{name} has values beyond the range of {np.dtype(dtype)}"
-        raise FrameError(msg)
+        raise FrameError(f"{name} has values beyond the range of {np.dtype(dtype)}")
     if largest > limit:
-        msg = f"{name} has magnitudes up to {largest:g}, wanted {limit:g} at most"
-        raise FrameError(msg)
+        raise FrameError(f"{name} has magnitudes up to {largest:g}, wanted {limit:g} at most")
     array = array.reshape(shape).astype(dtype)  # always a copy: the frame owns its data
     array.setflags(write=False)
     return array
@@ -76,8 +72,7 @@ def _direction(name: str, value: ArrayLike) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):  # an infinite length is no direction, either
         length = float(np.linalg.norm(given))
     if not 1e-6 <= length <= 1e6:
-        msg = f"{name} must be a direction, of a length from 1e-6 to 1e6, got {value!r}"
-        raise FrameError(msg)
+        raise FrameError(f"{name} must be a direction, of a length from 1e-6 to 1e6, got {value!r}")
     return checked_numbers(name, given / length, (3,), np.float32)
 
 
@@ -86,8 +81,7 @@ def _nanoseconds(name: str, value: Any) -> int:
     try:
         return int(value)
     except (TypeError, ValueError, OverflowError) as error:
-        msg = f"{name} must be a whole number of nanoseconds, got {value!r}"
-        raise FrameError(msg) from error
+        raise FrameError(f"{name} must be a whole number of nanoseconds, got {value!r}") from error
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.errors import FrameError, require_type
-from refu_core.frames import LAGS, N_JOINTS, SmplFrame
+from refu_core.frames import LAGS, SmplFrame
 
 _MOST_PEOPLE = 64
 """How many people are remembered, those seen last; each takes half a megabyte at most."""
@@ -112,12 +112,9 @@ def _past(moments: Sequence[_Moment]) -> NDArray[np.float32]:
     place = np.interp(-_LAGS, ages, np.arange(len(ages)))  # before the first moment, that one
     before = place.astype(int)
     after = np.minimum(before + 1, len(ages) - 1)
-    share = place - before
-    rotations = np.empty((len(_LAGS), N_JOINTS, 3, 3))
-    way = np.empty((len(_LAGS), 3))
-    for i, (a, b, w) in enumerate(zip(before, after, share, strict=True)):
-        rotations[i] = (1 - w) * moments[a].rotations + w * moments[b].rotations
-        way[i] = (1 - w) * moments[a].transl + w * moments[b].transl - now.transl
+    pairs = [(moments[a], moments[b], w) for a, b, w in zip(before, after, place - before, strict=True)]
+    rotations = np.stack([(1 - w) * a.rotations + w * b.rotations for a, b, w in pairs])
+    way = np.stack([(1 - w) * a.transl + w * b.transl for a, b, w in pairs]) - now.transl
     root = now.rotations[0]
     turned = rotations - now.rotations
     turned[:, 0] = root.T @ turned[:, 0]

@@ -103,12 +103,11 @@ class Connectivity:
         one_way = np.bincount(self.edge_of_corner.ravel(), weights=np.where(end > start, 1.0, -1.0)) != 0
         n_flipped = int(one_way[n_faces == 2].sum())
         if n_open or n_crowded or n_flipped:
-            msg = (
-                f"a signed distance needs a watertight body: {n_open} open edges, {n_crowded} edges of more than two "
-                f"faces and {n_flipped} edges whose two faces face opposite ways; close the mesh and orient its faces "
-                "outward"
+            edges = (
+                f"{n_open} open edges, {n_crowded} edges of more than two faces and {n_flipped} edges whose two faces "
             )
-            raise MeshError(msg)
+            fault = f"{edges}face opposite ways; close the mesh and orient its faces outward"
+            raise MeshError(f"a signed distance needs a watertight body: {fault}")
 
     @cached_property
     def across(self) -> NDArray[np.int32]:
@@ -142,18 +141,15 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
     """
     array = np.asarray(faces.cpu() if hasattr(faces, "cpu") else faces)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
-        msg = f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}"
-        raise MeshError(msg)
+        raise MeshError(f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}")
     low, high = int(array.min()), int(array.max())
     limit = n_vertices if n_vertices is not None else np.iinfo(np.int32).max
     if low < 0 or high >= limit:
-        msg = f"faces must index vertices 0 to {limit - 1}, got {low} to {high}"
-        raise MeshError(msg)
+        raise MeshError(f"faces must index vertices 0 to {limit - 1}, got {low} to {high}")
     repeated = (array == np.roll(array, 1, axis=1)).any(axis=1)
     if repeated.any():
-        msg = f"every face needs three different vertices; {repeated.sum()} of {len(array)} repeat one, "
-        msg += f"number {int(repeated.argmax())} (from 0) first: leave such faces out"
-        raise MeshError(msg)
+        bad = f"{repeated.sum()} of {len(array)} repeat one, number {int(repeated.argmax())} (from 0) first"
+        raise MeshError(f"every face needs three different vertices; {bad}: leave such faces out")
     return np.ascontiguousarray(array, dtype=np.int32)
 
 
@@ -174,40 +170,37 @@ def rim_of(faces: NDArray[np.int32]) -> NDArray[np.bool_]:
 def as_points(
     name: str, values: Any, n: int | None = None, *, dtype: type[np.floating[Any]] = np.float64
 ) -> NDArray[Any]:
-    """`values` (a tensor, too) as contiguous, finite points of the type `dtype`, shape (n, 3).
-
-    Raises:
-        MeshError: they aren't finite numbers of that shape.
-    """
+    """`values` (a tensor, too) as contiguous, finite points, shape (n, 3). Raises `MeshError` for anything else."""
+    shape = f"the shape ({'N' if n is None else n}, 3)"
     try:
         points = np.ascontiguousarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=dtype)
     except (TypeError, ValueError) as error:
-        msg = f"{name} must be numbers of the shape ({'N' if n is None else n}, 3), got {type(values).__name__}"
-        raise MeshError(msg) from error
+        raise MeshError(f"{name} must be numbers of {shape}, got {type(values).__name__}") from error
     if points.ndim != 2 or points.shape[1] != 3 or (n is not None and len(points) != n):
-        msg = f"{name} must have the shape ({'N' if n is None else n}, 3), got {points.shape}"
-        raise MeshError(msg)
+        raise MeshError(f"{name} must have {shape}, got {points.shape}")
     if not np.isfinite(points).all():
         bad = int((~np.isfinite(points)).any(axis=1).sum())
-        msg = f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates"
-        raise MeshError(msg)
+        raise MeshError(f"{name} must be finite, got {bad} of {len(points)} with NaN or infinite coordinates")
     # Torch warns about read-only arrays, and those of a pipeline are.
     return points if points.flags.writeable else points.copy()
 
 
+def face_normals(v: NDArray[_Float], f: NDArray[np.integer[Any]]) -> NDArray[_Float]:
+    """Normals of faces (F, 3) of vertices (V, 3), twice their area long, shape (F, 3)."""
+    return np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
+
+
 def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:
     """Unit normals at vertices (V, 3) of faces (F, 3): the area-weighted mean of faces around each, shape (V, 3)."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
     normals = np.zeros_like(vertices)
-    np.add.at(normals, faces, np.cross(b - a, c - a)[:, None])
+    np.add.at(normals, faces, face_normals(vertices, faces)[:, None])
     unit: NDArray[_Float] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     return unit
 
 
 def vertex_areas(vertices: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
     """A third of the area of the faces (F, 3) around each of the vertices (V, 3) [m²], shape (V,)."""
-    a, b, c = vertices[faces].astype(np.float64).transpose(1, 0, 2)
-    third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    third = np.linalg.norm(face_normals(vertices.astype(np.float64), faces), axis=1) / 6
     return np.bincount(faces.ravel(), np.repeat(third, 3), len(vertices)).astype(np.float64)
 
 

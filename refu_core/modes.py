@@ -40,8 +40,7 @@ class Choice(str, Enum):
         try:
             return cls(text)
         except ValueError:
-            msg = f"no {what} {text!r}: wanted {', '.join(cls)}"
-            raise error(msg) from None
+            raise error(f"no {what} {text!r}: wanted {', '.join(cls)}") from None
 
 
 class SdfMode(Choice):

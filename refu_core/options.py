@@ -75,13 +75,11 @@ def check(settings: Any) -> None:
     for name, spec in specs_of(type(settings)).items():
         value = getattr(settings, name)
         if spec.choices and value not in (*spec.choices, None):
-            msg = f"{name}: wanted {' or '.join(spec.choices)}, got {value!r}"
-            raise SettingsError(msg)
+            raise SettingsError(f"{name}: wanted {' or '.join(spec.choices)}, got {value!r}")
         low, high = spec.within or (-math.inf, math.inf)
         for number in (value if isinstance(value, tuple) else (value,)) if spec.within else ():
             if not low <= number <= high:  # NaN fails this, too
-                msg = f"{name}: wanted {low:g} to {high:g}, got {number:g}"
-                raise SettingsError(msg)
+                raise SettingsError(f"{name}: wanted {low:g} to {high:g}, got {number:g}")
 
 
 def arguments(settings: Any, *names: str) -> list[str]:
@@ -138,17 +136,14 @@ class PipelineOptions:
     def check_garments(self) -> None:
         """Raises `SettingsError` for garments that don't exist, or that can't be worn together."""
         if not self.garments or len(set(self.garments)) < len(self.garments):
-            msg = f"garments: wanted distinct names, at least one, got {list(self.garments)}"
-            raise SettingsError(msg)
+            raise SettingsError(f"garments: wanted distinct names, at least one, got {list(self.garments)}")
         try:
             bodies = {name: _template(name).body for name in self.garments}
         except RefuError as error:
-            msg = f"garments: {error}"
-            raise SettingsError(msg) from error
+            raise SettingsError(f"garments: {error}") from error
         if not (self.body or self.betas_from) and len(set(bodies.values())) > 1:
             cut_for = ", ".join(f"{name} ({body})" for name, body in bodies.items())
-            msg = f"garments: one person wears garments of one body, got {cut_for}"
-            raise SettingsError(msg)
+            raise SettingsError(f"garments: one person wears garments of one body, got {cut_for}")
 
     def check_files(self) -> None:
         """Raises `RefuError` for a device, a body or weights that don't exist, as far as can be seen at once."""
@@ -161,8 +156,7 @@ class PipelineOptions:
                 msg = f"no body {body!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or an .npz or .pkl file"
                 raise SettingsError(msg)
         if self.weights and not Path(self.weights).is_dir():
-            msg = f"no weights {self.weights!r}: wanted a folder"
-            raise SettingsError(msg)
+            raise SettingsError(f"no weights {self.weights!r}: wanted a folder")
         is_auto = self.backbone == BackboneName.AUTO
         for name in self.garments if self.backbone != BackboneName.SKINNED else ():
             folder = weights_folder(_template(name).name, self.weights or None)
@@ -173,9 +167,8 @@ class PipelineOptions:
             for stem in (f"{kind}-{self.sdf}", *(["dynamics"] if is_dynamic else [])):
                 path = folder / f"{stem}.safetensors"
                 if not path.is_file():
-                    msg = f"no weights of {stem.replace('-', ' ')} for {name}: {path} is missing; "
-                    msg += "train them (refu train)"
-                    raise SettingsError(msg)
+                    what = f"no weights of {stem.replace('-', ' ')} for {name}: {path} is missing"
+                    raise SettingsError(f"{what}; train them (refu train)")
 
     def load(self, **more: Any) -> GarmentPipeline:
         """The pipeline; `more` are other arguments of `GarmentPipeline.load`. Raises `RefuError` as that does."""

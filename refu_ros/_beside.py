@@ -1,9 +1,18 @@
-"""Work beside the stream, in threads of its own: loading pipelines, and dressing single frames on request."""
+"""Work beside the stream: loading pipelines, and dressing single frames on request, in threads of their own.
+
+A bag is dressed by `refu replay`, in a process of its own: it may take its time, and can be ended at any time.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import re
+import signal
+import subprocess
+import sys
+import tempfile
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,12 +24,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters import check_plausible
+from msg_adapters import KEYPOINT_TYPES, check_plausible
 from msg_adapters.axes import ros_from_sender, up_of_sender
 from refu_core import RefuError, SmplFrame
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.modes import BUILTIN_GARMENTS
-from refu_core.options import PipelineOptions
+from refu_core.options import PIPELINE_OPTIONS, PipelineOptions, arguments
+from refu_core.recordings import SUFFIXES
 from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
@@ -104,8 +114,7 @@ class RequestDresser:
         Raises `RefuError` where too many wait.
         """
         if not self._waiting.acquire(blocking=False):
-            msg = f"{_MOST_WAITING} requests wait already: ask again when one has been answered"
-            raise RefuError(msg)
+            raise RefuError(f"{_MOST_WAITING} requests wait already: ask again when one has been answered")
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, "dresser", initializer=_give_way)
         asked = self._pool.submit(self._dress, frame, settings, then)
@@ -127,8 +136,7 @@ class RequestDresser:
         rotation = ros_from_sender(settings.axes)
         placed = {name: (mesh.local + frame.transl) @ rotation.T for name, mesh in output.items()}
         if not all(np.isfinite(points).all() for points in placed.values()):
-            msg = "a garment isn't finite in this pose"
-            raise RefuError(msg)
+            raise RefuError("a garment isn't finite in this pose")
         return then(output, placed)
 
 
@@ -162,8 +170,7 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
     names, sdf = tuple(request.garments[:_MOST_GARMENTS]), request.sdf or settings.sdf
     known = list(dict.fromkeys([*settings.garments, *BUILTIN_GARMENTS]))
     if unknown := [name for name in names if name not in known] or request.garments[_MOST_GARMENTS:]:
-        msg = f"garments: wanted up to {_MOST_GARMENTS} of {', '.join(known)}, got {unknown[0]!r}"
-        raise RefuError(msg)
+        raise RefuError(f"garments: wanted up to {_MOST_GARMENTS} of {', '.join(known)}, got {unknown[0]!r}")
     # The style belongs to the garments in the parameters: others may have none.
     style = settings.style if names in ((), settings.garments) else (0.0,) * len(settings.style)
     asked = replace(settings, garments=names or settings.garments, sdf=sdf, style=style)
@@ -174,8 +181,7 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
 def asked_path(settings: NodeSettings, name: str) -> Path:
     """A path below the folder in the parameter `bags`. Raises `RefuError` for any other, links out of it included."""
     if not settings.bags:
-        msg = "a request may name no file: start the node with the parameter bags, a folder for them"
-        raise RefuError(msg)
+        raise RefuError("a request may name no file: start the node with the parameter bags, a folder for them")
     parts = name.split("/")
     # Path.resolve raises for links that lead in a circle; here they stay links.
     folder = Path(os.path.realpath(Path(settings.bags).expanduser()))
@@ -183,5 +189,65 @@ def asked_path(settings: NodeSettings, name: str) -> Path:
         path = Path(os.path.realpath(folder / name))
         if folder in path.parents and not path.is_symlink():
             return path
-    msg = f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}"
-    raise RefuError(msg)
+    raise RefuError(f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}")
+
+
+_PATIENCE_S = 10.0
+"""Time for a bag to be closed when its replay is ended [s]."""
+_INTERRUPTED = 130
+
+
+class BagJob:
+    """Dresses a bag; a thread calls `told` with the frames done and their total. `cancel` it from any thread.
+
+    Raises `RefuError` where the process can't be started.
+    """
+
+    def __init__(
+        self, bag: Path, output: Path, settings: NodeSettings, told: Callable[[int, int], object], *, topic: str = ""
+    ) -> None:
+        self.output = output
+        self._folder = tempfile.TemporaryDirectory(prefix="refu-replay-")
+        self._result = Path(self._folder.name, "result.json")
+        command = [sys.executable, "-m", "refu_lab", "replay", str(bag), f"--output={output}", "--progress=lines"]
+        given = ["betas_source", *["betas"] * bool(settings.known_betas), *["style"] * any(settings.style)]
+        if bag.suffix.lower() not in SUFFIXES:  # a file of motion says itself how it is to be read
+            given += ["input_axes", *["input_type", "keypoints"] * (settings.input_type in KEYPOINT_TYPES)]
+        command += [f"--topic={topic}"] * bool(topic)
+        command += [f"--json={self._result}", *arguments(settings, *PIPELINE_OPTIONS, "margin", "frame_id", *given)]
+        pipes: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        try:
+            self._process = subprocess.Popen(command, **pipes, start_new_session=True)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
+        except ProcessLookupError:  # it has ended already: `_wait` says why
+            pass
+        except OSError as error:
+            raise RefuError(f"no bag can be replayed: {error}") from error
+        pool = ThreadPoolExecutor(1, "bag")
+        self.done = pool.submit(self._wait, told)
+        """The result of `refu replay --json`, or a `RefuError` with the reason that the command gives."""
+        pool.shutdown(wait=False)
+
+    def _wait(self, told: Callable[[int, int], object]) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        said = ""
+        with self._folder, self._process.stdout as lines:
+            for line in lines:
+                if line.startswith(b"progress "):
+                    told(*map(int, line.split()[1:]))
+                else:
+                    said = line.decode(errors="replace").strip() or said
+            code = self._process.wait()
+            with contextlib.suppress(OSError, ValueError):
+                result: dict[str, Any] = json.loads(self._result.read_bytes())
+                return result
+        if code in (_INTERRUPTED, -signal.SIGTERM):
+            said = "cancelled before a frame was done"
+        raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
+
+    def cancel(self) -> None:
+        """Ends the process; the bag is closed, with the frames that are done."""
+        self._process.terminate()
+        last = threading.Timer(_PATIENCE_S, self._process.kill)
+        last.daemon = True
+        last.start()

@@ -18,6 +18,7 @@ from refu_ros._settings import NodeSettings
 _OVER_BUDGET = 0.1
 """Share of the frames that may be superseded before they are worked on."""
 _LOW_DISK_BYTES = 1 << 30
+_WENT_BACK = "was a clock set back, or do two send on one topic?"
 _FIRST_INPUT_S = 2.0
 """How long the node listens before it reports that somebody is missing [s]."""
 
@@ -98,11 +99,7 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
         (n := recent["drop.transform"], WARN, f"{n} of {received} have no transform: {reasons['transform']}"),
         (n := recent["drop.crowd"], WARN, f"{n} frames of people beyond the first: {reasons['crowd']}"),
         (silent_for is None and waited > _FIRST_INPUT_S, WARN, "no input yet"),
-        (
-            n := recent["back_in_time"],
-            WARN,
-            f"{n} stamps went back: was a clock set back, or do two send on one topic?",
-        ),
+        (n := recent["back_in_time"], WARN, f"{n} stamps went back: {_WENT_BACK}"),
     ]
     if missing and silent_for is not None and waited > _FIRST_INPUT_S:
         nobody = received and not persons
@@ -137,20 +134,14 @@ def _output(report: Report, settings: NodeSettings, now: Situation) -> Judgement
     causes = [cause for cause in ("device", "failed", "not_finite") if recent[f"drop.{cause}"]]
     failed = sum(recent[f"drop.{cause}"] for cause in causes)
     p50, p95, p99 = report.latency_ms
+    namesakes = f"{now.n_namesakes + 1} nodes have this name: start others with -r __ns:=/another_namespace"
+    late = f"over budget: {stale} of {received} frames were superseded; latency p95 {p95:.1f} ms"
     rules: list[tuple[object, int, str]] = [
         (report.last_error, ERROR, report.last_error),
         (now.state != "active", OK, f"not active but {now.state}"),
         (failed, ERROR, f"{failed} frames failed: {report.reasons[causes[0]] if causes else ''}"),
-        (
-            now.n_namesakes,
-            WARN,
-            f"{now.n_namesakes + 1} nodes have this name: start others with -r __ns:=/another_namespace",
-        ),
-        (
-            stale > _OVER_BUDGET * received,
-            WARN,
-            f"over budget: {stale} of {received} frames were superseded; latency p95 {p95:.1f} ms",
-        ),
+        (now.n_namesakes, WARN, namesakes),
+        (stale > _OVER_BUDGET * received, WARN, late),
         (recent["coarse"], WARN, f"people are over {COARSE_M:g} m away, and points are float32: use a local frame_id"),
         (now.listening_for is None, OK, "nobody listens"),
         (True, OK, f"{report.rate('ticks'):.1f} Hz, latency p95 {p95:.1f} ms"),

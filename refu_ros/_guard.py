@@ -120,8 +120,7 @@ def _bounded(callback: Callable[..., Any]) -> Callable[..., Any]:
     def call(request: Any, response: Any) -> Any:
         for name, kind in request.get_fields_and_field_types().items():
             if kind.startswith("sequence") and len(getattr(request, name)) > _MOST_ITEMS:
-                msg = f"wanted up to {_MOST_ITEMS} {name} in a request, got {len(getattr(request, name))}"
-                raise RefuError(msg)
+                raise RefuError(f"wanted up to {_MOST_ITEMS} {name} in a request, got {len(getattr(request, name))}")
         return callback(request, response)
 
     return call

@@ -22,8 +22,7 @@ def interface(name: str) -> Any:
         found = getattr(import_module(f"{package}.{kind}"), type_name)
         check_for_type_support(found)
     except (ImportError, AttributeError) as error:  # AttributeError: Python took a folder of definitions for it
-        msg = f"{name} isn't importable: install or source {package} ({error})"
-        raise RefuError(msg) from error
+        raise RefuError(f"{name} isn't importable: install or source {package} ({error})") from error
     except Exception as error:  # rosidl's own class, whose import would load a parser of definitions
         msg = f"{name} is of no use: install or build {package} anew, for this ROS and Python ({error})"
         raise RefuError(msg) from error

@@ -253,8 +253,7 @@ class Listener:
         refused = self._tf.put(data, is_static=is_static)
         self._place()
         if refused:
-            msg = f"{len(refused)} transforms left out, the first: {refused[0]}"
-            raise RefuError(msg)
+            raise RefuError(f"{len(refused)} transforms left out, the first: {refused[0]}")
 
     # Humans (REP-155) -----------------------------------------------------------------------------
 

@@ -24,9 +24,8 @@ from refu_ros._diagnostics import Situation, statuses
 from refu_ros._guard import LOG_PERIOD_S, GuardedNode, transition
 from refu_ros._interfaces import interface
 from refu_ros._listener import Listener
-from refu_ros._parameters import declare, parameter
 from refu_ros._requests import Requests
-from refu_ros._settings import NodeSettings
+from refu_ros._settings import NodeSettings, declare, parameter
 
 if TYPE_CHECKING:
     from refu_core.outputs import Fittings
@@ -291,8 +290,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         Raises `RefuError` where it can't.
         """
         if on and self._state != "active":
-            msg = f"the node is {self._state}: activate it first"
-            raise RefuError(msg)
+            raise RefuError(f"the node is {self._state}: activate it first")
         done = self.recording.switch(path or self.settings.record, on=on)
         self._attend()
         return done

@@ -1,12 +1,16 @@
-"""What the programs share: their command line, signals, the executor, and errors as one line."""
+"""What the programs share: their command line, signals, the executor, errors as one line, and shared memory."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 EXIT_BAD_INPUT = 2
@@ -86,3 +90,28 @@ def spin(node: Any, *, until: Callable[[], object]) -> None:
     spin_once = node.guarded("executor", executor.spin_once, lambda *_, **__: time.sleep(_BREATH_S))
     while not until():
         spin_once(timeout_sec=_LOOK_UP_S)
+
+
+PROFILES = Path(__file__).with_name("fastdds.xml")
+SEGMENT_BYTES = 40_000_000
+"""The segment of `fastdds.xml`: 512 pieces of 65,500 bytes, and some."""
+_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
+
+
+def make_room() -> bool:
+    """Has Fast DDS use `fastdds.xml`, in this process, before `rclpy.init`; returns whether it will.
+
+    Its default shared memory, half a megabyte, holds less than one message of garments. A subscriber that stands still
+    (in a debugger, or swapping) occupies what it hasn't read, at most the 512 pieces of 64 kB that its queue holds.
+    Once that fills the segment, nobody else gets anything either, often not even after the subscriber has gone. 40 MB
+    can't be filled.
+
+    If the user has configured Fast DDS in any of its ways, that stays. If there is too little shared memory (as in some
+    containers), Fast DDS keeps its defaults. Other middleware doesn't read the variable.
+    """
+    chosen = any(os.environ.get(name) for name in _VARIABLES) or Path("DEFAULT_FASTRTPS_PROFILES.xml").exists()
+    with suppress(OSError):  # there is no such memory
+        if not chosen and shutil.disk_usage("/dev/shm").free > SEGMENT_BYTES:
+            os.environ[_VARIABLES[0]] = str(PROFILES)
+            return True
+    return False

@@ -21,8 +21,7 @@ from msg_adapters import MESH, encode_mesh
 from msg_adapters.bags import free_path
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_ros._bag_job import BagJob
-from refu_ros._beside import RequestDresser, asked_frame, asked_path, asked_settings
+from refu_ros._beside import BagJob, RequestDresser, asked_frame, asked_path, asked_settings
 from refu_ros._guard import answer_no
 from refu_ros._interfaces import interface
 
@@ -140,13 +139,11 @@ class Requests:
     def _begin(self, goal: Any) -> BagJob:
         request = goal.request
         if self._job is not None:
-            msg = "another bag is being dressed: wait for it, or cancel it"
-            raise RefuError(msg)
+            raise RefuError("another bag is being dressed: wait for it, or cancel it")
         settings = asked_settings(request, self._node.settings)
         bag = asked_path(settings, request.bag)
         if not bag.exists():
-            msg = f"no bag {request.bag!r} in {settings.bags}"
-            raise RefuError(msg)
+            raise RefuError(f"no bag {request.bag!r} in {settings.bags}")
         output = free_path(bag.with_name(f"{bag.stem}-dressed.mcap"))
         self._node.get_logger().info(printable(f"dressing {bag} as {output}"))
 

@@ -1,17 +1,20 @@
-"""The node's parameters: what each means, what it may be, and whether it may change while the node runs."""
+"""The node's parameters: what each means, what it may be, and whether it may change; declared, and converted."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, WORLD_FRAME, InputAxes
+from refu_core.errors import printable
 from refu_core.keypoints import LAYOUTS
-from refu_core.options import DressOptions, SettingsError, check, fixed, setting
-from refu_ros._parameters import coerced
+from refu_core.options import DressOptions, SettingsError, Spec, check, fixed, setting, specs_of
+
+Settings = TypeVar("Settings")
 
 _PERSON = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 _FRAME = re.compile(r"[^/\s\x00-\x1f\x7f][^\s\x00-\x1f\x7f]{0,254}")
@@ -23,8 +26,7 @@ def require_persons(persons: Sequence[str]) -> list[str]:
     """Those of the persons that have a name. Raises `SettingsError` unless names are distinct and good for topics."""
     named = [*filter(None, persons)]
     if not all(map(_PERSON.fullmatch, named)) or len(set(persons)) < len(persons):
-        msg = f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}"
-        raise SettingsError(msg)
+        raise SettingsError(f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}")
     return named
 
 
@@ -106,22 +108,18 @@ class NodeSettings(DressOptions):
             msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
             raise SettingsError(msg)
         if unknown := sorted(set(self.points_fields) - {"", *POINT_FIELDS}):
-            msg = f"points_fields: wanted names of {', '.join(POINT_FIELDS)}, got {', '.join(unknown)}"
-            raise SettingsError(msg)
+            raise SettingsError(f"points_fields: wanted names of {', '.join(POINT_FIELDS)}, got {', '.join(unknown)}")
         if not _FRAME.fullmatch(self.frame_id):
             msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {self.frame_id!r}"
             raise SettingsError(msg)
         for name, path in (("record", self.record), ("weights", self.weights), ("bags", self.bags)):
             if path and not _names_a_folder(path):
-                msg = f"{name}: wanted the path of a folder, got {path!r}"
-                raise SettingsError(msg)
+                raise SettingsError(f"{name}: wanted the path of a folder, got {path!r}")
         if 0 < self.max_rate < _SLOWEST_HZ:
-            msg = f"max_rate: wanted {_SLOWEST_HZ:g} to 1000, or 0 for no limit, got {self.max_rate:g}"
-            raise SettingsError(msg)
+            raise SettingsError(f"max_rate: wanted {_SLOWEST_HZ:g} to 1000, or 0 for no limit, got {self.max_rate:g}")
         self.check_garments()
         if any(self.style) and (plain := self.of_one_style):
-            msg = f"style: {', '.join(plain)} has no styles; set it to zeros"
-            raise SettingsError(msg)
+            raise SettingsError(f"style: {', '.join(plain)} has no styles; set it to zeros")
 
     def changed(self, values: Mapping[str, Any]) -> NodeSettings:
         """These settings with some values as ROS has them (lists, numbers of any kind). Raises `SettingsError`."""
@@ -153,3 +151,91 @@ def _names_a_folder(path: str) -> bool:
         return "\0" not in path and Path(path).expanduser().absolute().name != ""
     except RuntimeError:  # the home of a user who doesn't exist
         return False
+
+
+def listing(kind: type) -> str:
+    """The parameters, one per line."""
+    specs = specs_of(kind).items()
+    return "\n".join(
+        ["parameters:", *(f"  {name:<20}{one.description} Default: {one.default!r}" for name, one in specs)]
+    )
+
+
+def declare(node: Any, kind: type[Settings]) -> Settings:
+    """Declares every parameter, returns what the node was started with, and warns of unknown parameters.
+
+    Raises `SettingsError` for values that have no meaning, and rclpy's own errors for values of a wrong type.
+    """
+    values = {}
+    for name, spec in specs_of(kind).items():
+        default = list(spec.default) if isinstance(spec.default, tuple) else spec.default
+        values[name] = node.declare_parameter(name, default, _descriptor(spec)).value
+    # A file of parameters may be for several nodes (`/**`), so an unknown one is no error.
+    for name in getattr(node, "_parameter_overrides", {}):
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            like = get_close_matches(name, values, n=1)
+            hint = f": is {like[0]} meant?" if like else ""
+            node.get_logger().warning(f"there is no parameter {printable(name)}{hint}")
+    return kind(**coerced(kind, values))
+
+
+def parameter(name: str, value: Any) -> Any:
+    """A parameter of ROS that holds a setting."""
+    from rclpy.parameter import Parameter
+
+    return Parameter(name, value=list(value) if isinstance(value, tuple) else value)
+
+
+def _descriptor(spec: Spec) -> Any:
+    from rclpy.node import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+    descriptor = ParameterDescriptor(description=spec.description, read_only=not spec.live)
+    descriptor.additional_constraints = " | ".join(spec.choices)
+    if spec.within is not None:
+        low, high = spec.within
+        if isinstance(spec.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
+    # Whole numbers are fine for floats (`max_rate:=30`); ROS alone would refuse them.
+    descriptor.dynamic_typing = spec.kind is float
+    return descriptor
+
+
+_TYPES: dict[type, tuple[str, Any]] = {
+    bool: ("true or false", bool),
+    int: ("a whole number", int),
+    float: ("a number", (int, float)),
+    str: ("a string", str),
+}
+"""For each type of parameter, what is wanted in words, and the types of values that are accepted."""
+
+
+def coerced(kind: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """ROS values as settings have them: tuples for lists, floats for whole numbers. Names not in `kind` are dropped.
+
+    Raises `SettingsError` for a value of another type.
+    """
+    specs = specs_of(kind)
+    return {name: _coerced(name, value, specs[name]) for name, value in values.items() if name in specs}
+
+
+def _coerced(name: str, value: Any, spec: Spec) -> Any:
+    kind, is_list = spec.kind, isinstance(spec.default, tuple)
+    wanted, items = _TYPES[kind][0], [value]
+    if is_list:
+        wanted = "a list of strings" if kind is str else f"a list of {len(spec.default)} numbers"
+        items = list(value) if hasattr(value, "__iter__") and not isinstance(value, (str, bytes)) else [None]
+        if kind is not str and len(items) != len(spec.default):
+            items = [None]
+    if not all(_is_of(kind, item) for item in items):
+        hint = "an empty list" if kind is str else "whole numbers and decimals mixed; write all as decimals"
+        hint = f": no value, or {hint}" if value is None and is_list else ""  # ROS turns these into None
+        raise SettingsError(f"{name}: wanted {wanted}, got {value!r}{hint}")
+    return tuple(map(kind, items)) if is_list else kind(value)
+
+
+def _is_of(kind: type, value: Any) -> bool:
+    if not isinstance(value, _TYPES[kind][1]) or isinstance(value, bool) != (kind is bool):
+        return False
+    return not isinstance(value, int) or abs(value) < 2**64  # as ROS has them; longer ones don't even fit a float

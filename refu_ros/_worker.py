@@ -76,18 +76,9 @@ class Worker:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        statistics: Statistics,
-        outlet: GarmentNode,
-        *,
-        settings: NodeSettings,
-        fittings: Fittings,
+        self, scene: Scene, statistics: Statistics, outlet: GarmentNode, *, settings: NodeSettings, fittings: Fittings
     ) -> None:
-        self.settings = settings
-        self._scene = scene
-        self._statistics = statistics
-        self._outlet = outlet
+        self.settings, self._scene, self._statistics, self._outlet = settings, scene, statistics, outlet
         self.fittings = self._planned_with = self._sent_with = fittings
         """The pipeline, and what is known of its garments; others may be put here at any time, for the next tick."""
         self._dressed: dict[str, _Known] = {}
@@ -121,13 +112,10 @@ class Worker:
     def _run(self) -> None:
         torch.set_num_threads(1)  # the robot's other nodes want their cores, too
         while not self._stopping.is_set():
-            self._work()
-
-    def _work(self) -> None:
-        try:
-            self.tick(self._take)
-        except Exception as error:  # whatever one frame brings up, the next may be good
-            self._fail(error, "")
+            try:
+                self.tick(self._take)
+            except Exception as error:  # noqa: PERF203 - whatever one frame brings up, the next may be good
+                self._fail(error, "")
 
     def _take(self) -> Mapping[str, Arrival]:
         """The newest frames, as soon as there are some, a thread of the pipeline is free, and the rate allows it."""
@@ -177,9 +165,8 @@ class Worker:
             near = {}
         frames = {person: settings.applied(arrival.frame) for person, arrival in near.items()}
         if fittings.pipeline.heeds_past:
-            frames = {
-                person: self._told(frame, person, _there(near[person], settings)) for person, frame in frames.items()
-            }
+            places = {person: _there(arrival, settings) for person, arrival in near.items()}
+            frames = {person: self._told(frame, person, places[person]) for person, frame in frames.items()}
         known: dict[str, _Known] = {}
         batch = _Batch(self._n_taken, settings, fittings, near, frames, known, gone)
         for person, frame in frames.items():

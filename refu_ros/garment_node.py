@@ -11,9 +11,7 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
 
-from refu_ros._parameters import listing
-from refu_ros._program import EXIT_BAD_INPUT, hear, run, spin
-from refu_ros._transport import make_room
+from refu_ros._program import EXIT_BAD_INPUT, hear, make_room, run, spin
 
 EXIT_DEVICE_LOST = 3
 _TOPICS = """\
@@ -38,7 +36,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _listing() -> str:
-    from refu_ros._settings import NodeSettings
+    from refu_ros._settings import NodeSettings, listing
 
     return f"{listing(NodeSettings)}\n{_TOPICS}"
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from refu_core import RefuError
-from refu_ros._transport import make_room
+from refu_ros._program import make_room
 
 
 class LiveTopics:
@@ -26,21 +27,17 @@ class LiveTopics:
 
             from refu_ros._interfaces import interface
         except ImportError as error:
-            msg = f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})'
-            raise RefuError(msg) from error
-        self._take, self._context = take, rclpy.Context()
+            raise RefuError(f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})') from error
+        self._context = rclpy.Context()
         try:
             rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             node = rclpy.create_node("refu_view", context=self._context, enable_rosout=False)
             self._node: Any = node
             for topic, kind in topics.items():
-                node.create_subscription(
-                    interface(kind), topic, lambda data, of=topic: self._take(of, data), 1, raw=True
-                )
+                node.create_subscription(interface(kind), topic, partial(take, topic), 1, raw=True)
         except Exception as error:
             self._context.try_shutdown()
-            msg = f"no topics {', '.join(topics)}: {error}"
-            raise RefuError(msg) from error
+            raise RefuError(f"no topics {', '.join(topics)}: {error}") from error
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(node)
         self._thread = threading.Thread(target=self._executor.spin, name="topics", daemon=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; its threads wait for busy cores
@@ -15,14 +15,13 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import INPUT_TYPES, SMPL_TOPIC, WORLD_FRAME, Encoder, encoder_for, load_motion
-from refu_core import FrameError, SmplFrame
+from refu_core import FrameError
 from refu_core.options import check, fixed
 from refu_core.recordings import Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
-from refu_ros._parameters import declare, listing
 from refu_ros._program import hear, run, spin
-from refu_ros._settings import AXES, require_persons
+from refu_ros._settings import AXES, declare, listing, require_persons
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,12 +96,7 @@ class SmplPublisher(GuardedNode):
                 self.get_logger().warning(f"{self.motion.source}: frame left out: {error}", throttle_duration_sec=5.0)
                 continue
             left = np.eye(3)[0 if self.options.input_axes == "smpl" else 1]
-            frame = SmplFrame(
-                frame.pose,
-                betas=frame.betas,
-                transl=frame.transl + i * self.options.spacing * left,
-                stamp_ns=stamp_ns,
-            )
+            frame = replace(frame, transl=frame.transl + i * self.options.spacing * left, stamp_ns=stamp_ns)
             output.publish(self.encode(frame, frame_id=self.options.frame_id))
         self._index += 1
 

@@ -50,8 +50,8 @@ from refu_core.options import SettingsError, specs_of
 from refu_core.outputs import Fittings
 from refu_ros._beside import PipelineLoader, RequestDresser, asked_path, load
 from refu_ros._diagnostics import Situation, statuses
+from refu_ros._program import PROFILES, SEGMENT_BYTES, make_room
 from refu_ros._settings import NodeSettings
-from refu_ros._transport import PROFILES, SEGMENT_BYTES, make_room
 from refu_ros._worker import Worker
 from tests.virtual_time import VirtualTime
 

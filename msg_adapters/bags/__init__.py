@@ -7,8 +7,8 @@ from msg_adapters.bags._reader import BagMessage as BagMessage
 from msg_adapters.bags._reader import BagReader as BagReader
 from msg_adapters.bags._recorder import Recorder as Recorder
 from msg_adapters.bags._recorder import RecorderState as RecorderState
+from msg_adapters.bags._recorder import RunningRecording as RunningRecording
 from msg_adapters.bags._recorder import free_path as free_path
-from msg_adapters.bags._recordings import RunningRecording as RunningRecording
 from msg_adapters.bags._smpl import FrameRecord as FrameRecord
 from msg_adapters.bags._smpl import SmplBag as SmplBag
 from msg_adapters.bags._smpl import iter_smpl_frames as iter_smpl_frames

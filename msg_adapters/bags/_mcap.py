@@ -1,4 +1,4 @@
-"""The records of an MCAP file, taken apart without trusting any of their lengths.
+"""One MCAP file of a bag, taken apart without trusting any of its lengths: its topics, as they are met, and messages.
 
 A record is an opcode, a length and its content; a chunk's content is more records, compressed. Damaged parts
 are reported and left out; what comes before them (and, where the framing holds, after them) is read.
@@ -12,13 +12,18 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO
 
 import zstandard
 
+from msg_adapters.bags._metadata import BETAS_OF, TopicInfo
+from msg_adapters.cdr import Buffer
+from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
 from refu_core._files import open_file
 
@@ -77,8 +82,7 @@ class Budget:
         """Raises `DamageError` when there is nothing left."""
         left = self._left[what] - amount
         if left < 0:
-            msg = "more {} than a bag of this size has; the rest is left out"
-            raise DamageError(msg, what)
+            raise DamageError("more {} than a bag of this size has; the rest is left out", what)
         self._left[what] = left
 
 
@@ -90,8 +94,7 @@ class Fields:
 
     def take(self, size: int) -> memoryview:
         if size > len(self.left):
-            msg = "a field of {} bytes where {} are left"
-            raise DamageError(msg, size, len(self.left))
+            raise DamageError("a field of {} bytes where {} are left", size, len(self.left))
         view, self.left = self.left[:size], self.left[size:]
         return view
 
@@ -102,8 +105,7 @@ class Fields:
         try:
             return str(self.take(self.number(4)), "utf-8")
         except UnicodeDecodeError as error:
-            msg = "a string that isn't UTF-8 ({})"
-            raise DamageError(msg, error.reason) from None
+            raise DamageError("a string that isn't UTF-8 ({})", error.reason) from None
 
     def string_map(self, budget: Budget) -> dict[str, str]:
         entries, result = Fields(self.take(self.number(4))), {}
@@ -117,8 +119,7 @@ class Fields:
 def parse_message(content: memoryview) -> tuple[int, int, int, memoryview]:
     """A message's channel, log time and publish time [ns], and its payload, still a view. Raises `DamageError`."""
     if len(content) < _MESSAGE_HEADER.size:
-        msg = "a message record of {} bytes"
-        raise DamageError(msg, len(content))
+        raise DamageError("a message record of {} bytes", len(content))
     channel, _, log_ns, publish_ns = _MESSAGE_HEADER.unpack_from(content)
     return channel, log_ns, publish_ns, content[_MESSAGE_HEADER.size :]
 
@@ -129,8 +130,7 @@ def parse_message_counts(content: memoryview) -> dict[int, int]:
     fields.take(8 + 2 + 4 + 4 + 4 + 4 + 8 + 8)
     counts = Fields(fields.take(fields.number(4)))
     if len(counts.left) > _MAX_CHANNELS * 10:
-        msg = "statistics of more channels than there can be"
-        raise DamageError(msg)
+        raise DamageError("statistics of more channels than there can be")
     result = {}
     while counts.left:
         channel = counts.number(2)
@@ -146,19 +146,15 @@ def unpack_chunk(content: memoryview, budget: Budget) -> memoryview:
     compression = fields.string()
     packed = fields.take(fields.number(8))
     if size > MAX_CHUNK_BYTES:
-        msg = "a chunk that unpacks to {} MiB, at most {} are read"
-        raise DamageError(msg, size >> 20, MAX_CHUNK_BYTES >> 20)
+        raise DamageError("a chunk that unpacks to {} MiB, at most {} are read", size >> 20, MAX_CHUNK_BYTES >> 20)
     if size > max(_SMALL_CHUNK, _MAX_RATIO * len(packed)):
-        msg = "a chunk of {} bytes that unpacks to {} MiB"
-        raise DamageError(msg, len(packed), size >> 20)
+        raise DamageError("a chunk of {} bytes that unpacks to {} MiB", len(packed), size >> 20)
     budget.spend("bytes unpacked", size)
     records = packed if not compression else memoryview(_decompress(compression, packed, size))
     if len(records) != size:
-        msg = "a chunk that unpacks to {} bytes where {} were announced"
-        raise DamageError(msg, len(records), size)
+        raise DamageError("a chunk that unpacks to {} bytes where {} were announced", len(records), size)
     if crc and zlib.crc32(records) != crc:
-        msg = "a chunk whose checksum is wrong"
-        raise DamageError(msg)
+        raise DamageError("a chunk whose checksum is wrong")
     return records
 
 
@@ -171,21 +167,17 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
             ) as reader:
                 return reader.read(size + 1)
         except (zstandard.ZstdError, MemoryError) as error:
-            msg = "a chunk that zstd can't unpack ({})"
-            raise DamageError(msg, error) from None
+            raise DamageError("a chunk that zstd can't unpack ({})", error) from None
     if compression == "lz4":
         try:
             lz4 = import_module("lz4.frame")  # optional: rosbag2 compresses with zstd
         except ImportError as error:
-            msg = "the bag is compressed with lz4; install it: pip install lz4"
-            raise BagError(msg) from error
+            raise BagError("the bag is compressed with lz4; install it: pip install lz4") from error
         try:
             return bytes(lz4.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
         except (RuntimeError, EOFError, MemoryError) as error:
-            msg = "a chunk that lz4 can't unpack ({})"
-            raise DamageError(msg, error) from None
-    msg = "a chunk of unknown compression {!r}"
-    raise DamageError(msg, compression)
+            raise DamageError("a chunk that lz4 can't unpack ({})", error) from None
+    raise DamageError("a chunk of unknown compression {!r}", compression)
 
 
 def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -193,15 +185,13 @@ def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:
     at = 0
     while at < len(content):
         if len(content) - at < _RECORD_HEADER.size:
-            msg = "{} bytes where a record should start"
-            raise DamageError(msg, len(content) - at)
+            raise DamageError("{} bytes where a record should start", len(content) - at)
         opcode, length = _RECORD_HEADER.unpack_from(content, at)
         if opcode == 0:
             raise DamageError(_NO_OPCODE)
         at += _RECORD_HEADER.size
         if length > len(content) - at:
-            msg = "a record of {} bytes where {} are left"
-            raise DamageError(msg, length, len(content) - at)
+            raise DamageError("a record of {} bytes where {} are left", length, len(content) - at)
         yield opcode, content[at : at + length]
         at += length
 
@@ -213,8 +203,7 @@ def open_bag_file(path: Path) -> tuple[BinaryIO, bytes]:
         return file, file.read(_LONGEST_MAGIC)
     except OSError as error:
         file.close()
-        msg = f"{path}: can't be read: {error.strerror}"
-        raise BagError(msg) from error
+        raise BagError(f"{path}: can't be read: {error.strerror}") from error
 
 
 def read_summary(file: BinaryIO) -> Iterable[tuple[int, memoryview]]:
@@ -252,8 +241,7 @@ def iter_records(file: BinaryIO) -> Iterator[tuple[int, memoryview, int]]:
     while True:
         header = file.read(_RECORD_HEADER.size)
         if len(header) < _RECORD_HEADER.size:
-            msg = "the file ends at byte {} without its closing records"
-            raise DamageError(msg, size)
+            raise DamageError("the file ends at byte {} without its closing records", size)
         opcode, length = _RECORD_HEADER.unpack(header)
         if opcode == 0:
             raise DamageError(_NO_OPCODE)
@@ -270,3 +258,121 @@ def iter_records(file: BinaryIO) -> Iterator[tuple[int, memoryview, int]]:
         if opcode in (DATA_END, FOOTER):
             return
         at += _RECORD_HEADER.size + length
+
+
+StoredMessage = tuple[TopicInfo, int, int, Buffer]
+"""A message's topic, log time and publish time [ns], and the message."""
+
+
+class _Catalogue:
+    """The schemas and channels of one file, as they are met."""
+
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
+        self._schemas: dict[int, tuple[str, str]] = {}
+        """Type and `ros2msg` text."""
+        self.channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
+        """Schema's number, topic, encoding and metadata, by the channel's number."""
+        self._known: dict[tuple[int, bytes], bytes] = {}
+        self._topics: dict[int, TopicInfo] = {}
+
+    def add(self, opcode: int, content: memoryview) -> None:
+        """Take in a schema or channel record; raises `DamageError`."""
+        if opcode not in (SCHEMA, CHANNEL):
+            return
+        raw = bytes(content)
+        key = opcode, raw[:2]  # its number
+        if self._known.get(key) == raw:  # each chunk may repeat it, and so does the summary
+            return
+        self._budget.spend("bytes of declarations", len(content))
+        fields = Fields(content)
+        number = fields.number(2)
+        if opcode == SCHEMA:
+            name, encoding = fields.string(), fields.string()
+            text = str(fields.take(fields.number(4)), "utf-8", "replace") if encoding == "ros2msg" else ""
+            self._schemas[number] = full_type_name(name), text
+        else:
+            schema, topic, encoding = fields.number(2), fields.string(), fields.string()
+            self.channels[number] = schema, topic, encoding, fields.string_map(self._budget)
+        self._known[key] = raw
+        self._topics.clear()
+
+    def topic(self, number: int) -> TopicInfo | None:
+        """The topic of a channel; None for one that wasn't declared."""
+        if number not in self._topics and number in self.channels:
+            schema, topic, encoding, metadata = self.channels[number]
+            message_type, definition = self._schemas.get(schema, ("", ""))
+            type_hash, betas_of = metadata.get("topic_type_hash", ""), metadata.get(BETAS_OF, "")
+            self._topics[number] = TopicInfo(topic, message_type, encoding, 0, definition, type_hash, betas_of)
+        return self._topics.get(number)
+
+
+class McapFile:
+    """Reads an MCAP file; damaged parts are reported and left out. Raises `BagError` where it can't be read."""
+
+    def __init__(self, path: Path, report: Callable[[DamageError], None]) -> None:
+        self._path, self.report = path, report
+
+    def topics(self, budget: Budget, *, by_reading: bool) -> tuple[list[tuple[TopicInfo, int]], bool]:
+        """The topics with their message counts, and whether these are only claimed by the summary.
+
+        The summary is trusted if it declares every channel that it counts, and not `by_reading`.
+        """
+        catalogue, counts = self._summary(budget)
+        claimed = not by_reading and counts is not None and counts.keys() <= catalogue.channels.keys()
+        if not claimed or counts is None:
+            counts = Counter(channel for channel, *_ in self._all_messages(catalogue, budget))
+        found = ((catalogue.topic(number), counts.get(number, 0)) for number in catalogue.channels)
+        return [(topic, count) for topic, count in found if topic is not None], claimed
+
+    def messages(self, budget: Budget) -> Iterator[StoredMessage]:
+        """The messages in the order they were recorded."""
+        catalogue, _ = self._summary(budget)
+        for channel, log_ns, publish_ns, data in self._all_messages(catalogue, budget):
+            topic = catalogue.topic(channel)
+            if topic is None:
+                self.report(DamageError("a message of the undeclared channel {}", channel))
+            else:
+                yield topic, log_ns, publish_ns, data
+
+    @contextmanager
+    def _opened(self) -> Iterator[BinaryIO]:
+        """The open file; damage ends the `with` block and is reported."""
+        file, _ = open_bag_file(self._path)
+        with file:
+            try:
+                yield file
+            except DamageError as damage:
+                self.report(damage)
+            except OSError as error:
+                raise BagError(f"{self._path}: can't be read: {error.strerror}") from error
+
+    def _summary(self, budget: Budget) -> tuple[_Catalogue, Mapping[int, int] | None]:
+        """The channels that the summary at the file's end declares, and their message counts (None: it gives none)."""
+        catalogue = _Catalogue(budget)
+        counts: dict[int, int] | None = None
+        with self._opened() as file:
+            for opcode, content in read_summary(file):
+                catalogue.add(opcode, content)
+                if opcode == STATISTICS:
+                    counts = parse_message_counts(content)
+        return catalogue, counts
+
+    def _all_messages(self, catalogue: _Catalogue, budget: Budget) -> Iterator[tuple[int, int, int, memoryview]]:
+        with self._opened() as file:
+            for opcode, content, place in iter_records(file):
+                try:
+                    if opcode == CHUNK:
+                        for inner, record in split_records(unpack_chunk(content, budget)):
+                            budget.spend("records")
+                            if inner == MESSAGE:
+                                yield parse_message(record)
+                            else:
+                                catalogue.add(inner, record)
+                    elif opcode == MESSAGE:
+                        yield parse_message(content)
+                    else:
+                        catalogue.add(opcode, content)
+                except DamageError as damage:  # noqa: PERF203 - the next record may be whole
+                    damage.where = f", in the record at byte {place}"
+                    self.report(damage)

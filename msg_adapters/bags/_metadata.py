@@ -107,8 +107,7 @@ def _load(text: str | bytes) -> Any:
     for count, event in enumerate(yaml.parse(text, Loader=_PARSER)):
         is_odd |= count > _MAX_EVENTS or len(nodes) > _MAX_DEPTH or isinstance(event, yaml.AliasEvent)
         if is_odd:
-            msg = "directives, aliases, or more than is read"
-            raise yaml.YAMLError(msg)
+            raise yaml.YAMLError("directives, aliases, or more than is read")
         if isinstance(event, yaml.ScalarEvent):
             nodes[-1].append(_scalar(event.value) if event.implicit[0] else event.value)
         elif isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
@@ -186,7 +185,6 @@ def read_file_paths(directory: Path) -> list[Path]:
         msg = f"{path}: not rosbag2 metadata ({type(error).__name__}); give one of the bag's files instead"
         raise BagError(msg) from error
     if storage not in STORAGES or compression != "none":
-        msg = f"{directory}: stored as {storage} with compression mode {compression}, only plain "
-        msg += f"{' or '.join(STORAGES)} is read; convert it with `ros2 bag convert`"
-        raise BagError(msg)
+        how = f"stored as {storage} with compression mode {compression}, only plain {' or '.join(STORAGES)} is read"
+        raise BagError(f"{directory}: {how}; convert it with `ros2 bag convert`")
     return [directory / name for name in dict.fromkeys(names)]

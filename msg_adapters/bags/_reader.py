@@ -11,8 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from msg_adapters.bags._mcap import MAGIC, WANTED_FILE, Budget, DamageError, open_bag_file
-from msg_adapters.bags._mcap_file import McapFile
+from msg_adapters.bags._mcap import MAGIC, WANTED_FILE, Budget, DamageError, McapFile, open_bag_file
 from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, TopicInfo, read_file_paths
 from msg_adapters.bags._sqlite import MAGIC as SQLITE_MAGIC
 from msg_adapters.bags._sqlite import SqliteFile
@@ -83,13 +82,11 @@ class BagReader:
             try:
                 files = sorted((f for f in self.path.iterdir() if f.suffix in BAG_SUFFIXES), key=_by_number)
             except OSError as error:
-                msg = f"{self.path}: can't be read: {error.strerror}"
-                raise BagError(msg) from error
+                raise BagError(f"{self.path}: can't be read: {error.strerror}") from error
             missing = f"no {METADATA_FILE} (was the recording interrupted?); its files are read by name"
             self._notes.append(f"{self.path}: {missing}")
         if not files:
-            msg = f"{self.path}: no {' or '.join(BAG_SUFFIXES)} file in this directory"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: no {' or '.join(BAG_SUFFIXES)} file in this directory")
         return files
 
     def _open(self, path: Path) -> McapFile | SqliteFile:
@@ -102,8 +99,7 @@ class BagReader:
         if start.startswith(MAGIC):
             return McapFile(path, report)
         hint = "convert it with `rosbags-convert`" if start.startswith(b"#ROSBAG") else f"wanted {WANTED_FILE}"
-        msg = f"{path}: not an MCAP file; {hint}"
-        raise BagError(msg)
+        raise BagError(f"{path}: not an MCAP file; {hint}")
 
     def _report(self, path: Path, damage: DamageError) -> None:
         self.truncated = True

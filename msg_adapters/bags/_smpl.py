@@ -85,12 +85,10 @@ def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Se
     if name is not None:
         chosen = next((topic for topic in topics if topic.name.lstrip("/") == name.lstrip("/")), None)
         if chosen is None:
-            msg = f"{path}: no topic {name}; the bag has {_listing(topics)}"
-            raise BagError(msg)
+            raise BagError(f"{path}: no topic {name}; the bag has {_listing(topics)}")
         if chosen.message_type not in kinds:
             what = "a body" if len(kinds) > 1 else wanted
-            msg = f"{path}: {_listing([chosen])} doesn't carry {what}; wanted {wanted}"
-            raise BagError(msg)
+            raise BagError(f"{path}: {_listing([chosen])} doesn't carry {what}; wanted {wanted}")
         return chosen
     found = [topic for topic in topics if topic.message_type in kinds and topic.message_count]
     # A robot's own joint states have an input type too: before giving up, prefer the name the node listens to.
@@ -120,14 +118,11 @@ def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str
         topics = reader.count()  # don't trust a summary that says a topic is empty
     if not any(info.message_count for info in topics):
         why = "; " + "; ".join(reader.warnings) if reader.warnings else ""
-        msg = f"{reader.path}: no message in this bag{why}"
-        raise BagError(msg)
+        raise BagError(f"{reader.path}: no message in this bag{why}")
     chosen = _choose(reader.path, topics, topic, kinds)
     if chosen.encoding != "cdr":
-        msg = (
-            f"{reader.path}: {chosen.name} is encoded as {chosen.encoding or 'nothing'}; wanted cdr, as ROS 2 writes it"
-        )
-        raise BagError(msg)
+        what = f"{chosen.name} is encoded as {chosen.encoding or 'nothing'}"
+        raise BagError(f"{reader.path}: {what}; wanted cdr, as ROS 2 writes it")
     decoder = None if of_keypoints else decoder_for(chosen.message_type, definition=chosen.definition or None)
     return SmplBag(reader, chosen, decoder)
 

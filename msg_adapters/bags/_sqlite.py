@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError
-from msg_adapters.bags._mcap_file import StoredMessage
+from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError, StoredMessage
 from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
@@ -40,12 +39,10 @@ class SqliteFile:
                 self._columns = {name: _columns(database, name) for name in _NEEDED}
                 self._definitions = _columns(database, "message_definitions")
         except DamageError as damage:
-            msg = printable(f"{path}: {damage}")
-            raise BagError(msg) from damage
+            raise BagError(printable(f"{path}: {damage}")) from damage
         for name, needed in _NEEDED.items():
             if missing := needed - self._columns[name]:
-                msg = f"{path}: not a bag: wanted rosbag2's table {name!r} with {', '.join(sorted(missing))}"
-                raise BagError(msg)
+                raise BagError(f"{path}: not a bag: wanted rosbag2's table {name!r} with {', '.join(sorted(missing))}")
 
     @contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:
@@ -59,8 +56,7 @@ class SqliteFile:
                 database.execute("PRAGMA cell_size_check = ON")
                 yield database
         except _ERRORS as error:
-            msg = "the database can't be read ({})"
-            raise DamageError(msg, error) from error
+            raise DamageError("the database can't be read ({})", error) from error
 
     def topics(self, budget: Budget, *, by_reading: bool) -> tuple[list[tuple[TopicInfo, int]], bool]:  # noqa: ARG002
         """The topics with their message counts, and False: the counts always come from reading, not from a claim."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -77,10 +77,7 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if error is None:
-            self.finish()
-            return
-        with suppress(BagError):  # the original error says more
+        with nullcontext() if error is None else suppress(BagError):  # the original error says more
             self.finish()
 
     @property
@@ -128,18 +125,12 @@ class BagWriter:
         Raises `BagError` for an undeclared topic, a time that rosbag2 can't hold, and when writing fails.
         """
         if topic not in self._topics:
-            msg = f"{self.path}: {topic} isn't declared; call add_topic first"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: {topic} isn't declared; call add_topic first")
         if not 0 <= log_time_ns <= MAX_TIME_NS:
-            msg = f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}")
         with self._writing():
-            self._writer.add_message(
-                self._channels[topic],
-                data,
-                log_time_ns=log_time_ns,
-                sequence=self._topics[topic].message_count & 0xFFFFFFFF,
-            )
+            sequence = self._topics[topic].message_count & 0xFFFFFFFF
+            self._writer.add_message(self._channels[topic], data, log_time_ns=log_time_ns, sequence=sequence)
         self._topics[topic].message_count += 1
         self._start_ns = min(self._start_ns, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
@@ -162,9 +153,9 @@ class BagWriter:
         """
         if self._finished:
             return
-        start_ns, end_ns = min(self._start_ns, self._end_ns), self._end_ns
-        topics = [*self._topics.values()]
-        text, record = dump_metadata(file_name=self.file_path.name, topics=topics, start_ns=start_ns, end_ns=end_ns)
+        start_ns, topics = min(self._start_ns, self._end_ns), [*self._topics.values()]
+        name, end_ns = self.file_path.name, self._end_ns
+        text, record = dump_metadata(file_name=name, topics=topics, start_ns=start_ns, end_ns=end_ns)
         with self._writing():
             self._writer.add_metadata("rosbag2", {"serialized_metadata": record})
             self._writer.finish()
@@ -211,8 +202,7 @@ class BagWriter:
             self._made.append(folder)
         self._entered = [*(folder.parent for folder in self._made), parent]
         if overwrite and self.file_path.is_fifo():
-            msg = f"{self.path}: a FIFO; choose another path"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: a FIFO; choose another path")
         if overwrite and (self._old or self.file_path.is_file()):
             self._target = Path(os.path.realpath(self.file_path))
             self._working = self._target.with_name(f"{self._target.name}{_PARTIAL}")
@@ -220,8 +210,7 @@ class BagWriter:
         try:
             stream = self._working.open("wb" if overwrite else "xb")
         except FileExistsError as error:
-            msg = f"{self.path}: exists already; choose another path, or overwrite it"
-            raise BagError(msg) from error
+            raise BagError(f"{self.path}: exists already; choose another path, or overwrite it") from error
         if is_new:
             self._made.append(self._working)
         return stream
@@ -234,29 +223,23 @@ class BagWriter:
             own |= {file.name for file in read_file_paths(directory)}
         others = [file.name for file in found if file.name.removesuffix(_PARTIAL) not in own]
         if found and (others or not overwrite):
-            hint = (
-                f"it holds other files than a bag's: {others[0]}"
-                if overwrite
-                else "choose another path, or overwrite it"
-            )
-            msg = f"{directory}: the directory isn't empty; {hint}"
-            raise BagError(msg)
+            foreign = f"it holds other files than a bag's: {others[0]}" if overwrite else ""
+            hint = foreign or "choose another path, or overwrite it"
+            raise BagError(f"{directory}: the directory isn't empty; {hint}")
         return [file for file in found if not file.name.endswith(_PARTIAL)]
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         """Turn file system errors into a `BagError` of one line, and leave a readable file whatever interrupts."""
         if self._finished:
-            msg = f"{self.path}: the bag is finished; nothing can be added"
-            raise BagError(msg)
+            raise BagError(f"{self.path}: the bag is finished; nothing can be added")
         try:
             yield
         except BagError:
             raise
         except (OSError, ValueError) as error:  # ValueError: a name that no file system takes
             self._abandon()
-            msg = f"{self.path}: can't be written: {getattr(error, 'strerror', None) or error}"
-            raise BagError(msg) from error
+            raise BagError(f"{self.path}: can't be written: {getattr(error, 'strerror', None) or error}") from error
         except BaseException:
             self._abandon()
             raise

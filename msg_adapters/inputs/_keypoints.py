@@ -20,10 +20,7 @@ from msg_adapters.cdr import Buffer, CdrReader
 from msg_adapters.errors import DecodeError, decoding
 from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
-KEYPOINT_TYPES: dict[str, str] = {
-    "keypoint_poses": "geometry_msgs/msg/PoseArray",
-    "keypoint_markers": MARKER_ARRAY,
-}
+KEYPOINT_TYPES: dict[str, str] = {"keypoint_poses": "geometry_msgs/msg/PoseArray", "keypoint_markers": MARKER_ARRAY}
 """Message type of each input type that holds keypoints."""
 
 _CUBE, _SPHERE, _ADD = 1, 2, 0
@@ -48,25 +45,15 @@ class Keypoints:
 
 
 def decode_keypoints(input_type: str, data: Buffer, n: int) -> dict[str, Keypoints]:
-    """Everybody's keypoints in a CDR message of one of `KEYPOINT_TYPES`; an empty message has nobody.
+    """Everybody's keypoints, `n` each, by name, in a CDR message of one of `KEYPOINT_TYPES`; an empty one has nobody.
 
-    Args:
-        input_type: a key of `KEYPOINT_TYPES`.
-        data: the message.
-        n: number of keypoints of a person.
+    A person's name comes from the namespace: a letter, then letters, digits and underscores; a number tells persons of
+    one namespace apart. It is empty for a PoseArray and for a single person without a namespace.
 
-    Returns:
-        Keypoints by person. The name comes from the namespace: a letter, then letters, digits and underscores; a number
-        tells persons of one namespace apart. It is empty for a PoseArray and for a single person without a namespace.
-
-    Raises:
-        DecodeError: damaged bytes, another number of keypoints, no keypoints among the markers.
+    Raises `DecodeError`: damaged bytes, another number of keypoints, no keypoints among the markers.
     """
-    if input_type == "keypoint_poses":
-        with decoding(KEYPOINT_TYPES["keypoint_poses"]):
-            return _of_poses(data, n)
-    with decoding(MARKER_ARRAY):
-        return _of_markers(decode_marker_array(data), n)
+    with decoding(KEYPOINT_TYPES[input_type]):
+        return _of_poses(data, n) if input_type == "keypoint_poses" else _of_markers(decode_marker_array(data), n)
 
 
 def _of_poses(data: Buffer, n: int) -> dict[str, Keypoints]:

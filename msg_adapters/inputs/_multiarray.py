@@ -28,21 +28,17 @@ _MIN_DIMENSION_BYTES = 12
 def _blocks(dimensions: Sequence[tuple[Any, ...]], offset: int, data: NDArray[Any]) -> dict[str, Any]:
     """The declared blocks by label; each of `dimensions` is a label, a size and a stride."""
     if not dimensions:
-        msg = f"the layout of {data.size} numbers isn't declared; {_LABELLING}"
-        raise DecodeError(msg)
+        raise DecodeError(f"the layout of {data.size} numbers isn't declared; {_LABELLING}")
     blocks: dict[str, Any] = {}
     start = end = offset
     for label, size, stride in dimensions:
         if label not in _SIZES or label in blocks:
             what = "label" if label not in _SIZES else "second"
-            msg = f"unexpected {what} {label!r} in layout.dim; {_LABELLING}"
-            raise DecodeError(msg)
+            raise DecodeError(f"unexpected {what} {label!r} in layout.dim; {_LABELLING}")
         if size != _SIZES[label]:
-            msg = f"{label} must have {_SIZES[label]} numbers, its dimension says {size}"
-            raise DecodeError(msg)
+            raise DecodeError(f"{label} must have {_SIZES[label]} numbers, its dimension says {size}")
         if stride and stride < size:
-            msg = f"the stride of {label} must be 0 or at least its size {size}, got {stride}"
-            raise DecodeError(msg)
+            raise DecodeError(f"the stride of {label} must be 0 or at least its size {size}, got {stride}")
         end = start + size
         blocks[label] = data[start:end]
         start += stride or size
@@ -50,8 +46,7 @@ def _blocks(dimensions: Sequence[tuple[Any, ...]], offset: int, data: NDArray[An
         msg = f"the layout declares {end} numbers, the data has {data.size}; check sizes, strides and data_offset"
         raise DecodeError(msg)
     if "pose" not in blocks:
-        msg = f"the layout declares {', '.join(blocks)} but no pose; {_LABELLING}"
-        raise DecodeError(msg)
+        raise DecodeError(f"the layout declares {', '.join(blocks)} but no pose; {_LABELLING}")
     return blocks
 
 
@@ -61,8 +56,7 @@ def from_bytes(data: Buffer) -> SmplFrame:
         reader = CdrReader(data)
         count = reader.length(item_bytes=_MIN_DIMENSION_BYTES)
         if count > _MAX_DIMENSIONS:
-            msg = f"{count} dimensions in layout.dim; {_LABELLING}"
-            raise DecodeError(msg)
+            raise DecodeError(f"{count} dimensions in layout.dim; {_LABELLING}")
         dimensions = [reader.fields("sII") for _ in range(count)]
         (offset,) = reader.fields("I")
         values = reader.array("f4", reader.length(item_bytes=4))

@@ -29,17 +29,15 @@ def from_bytes(data: Buffer) -> SmplFrame:
         stamp_ns, _ = reader.fields("Ts")
         count = reader.length(item_bytes=_POSE_NUMBERS * 8)
         if count != N_JOINTS:
-            msg = f"wanted {N_JOINTS} poses, one for each joint of SMPL, got {count}; "
-            msg += "points of a tracker are the input type keypoint_poses"
-            raise DecodeError(msg)
+            hint = "points of a tracker are the input type keypoint_poses"
+            raise DecodeError(f"wanted {N_JOINTS} poses, one for each joint of SMPL, got {count}; {hint}")
         poses = reader.array("f8", N_JOINTS * _POSE_NUMBERS).reshape(N_JOINTS, _POSE_NUMBERS).astype(np.float64)
         reader.finish()
         quaternions = poses[:, 3:]
         largest = np.abs(quaternions).max(axis=1)
         for joint in np.flatnonzero(~((largest >= _MIN_NORM) & np.isfinite(largest))):
-            msg = f"the orientation of {JOINT_NAMES[joint]} isn't a rotation: {quaternions[joint].tolist()}"
-            msg += "; an identity is (0, 0, 0, 1)"
-            raise DecodeError(msg)
+            got = f"the orientation of {JOINT_NAMES[joint]} isn't a rotation: {quaternions[joint].tolist()}"
+            raise DecodeError(f"{got}; an identity is (0, 0, 0, 1)")
         pose: NDArray[Any] = Rotation.from_quat(quaternions / largest[:, None]).as_rotvec()  # their squares are finite
         return SmplFrame(pose, transl=poses[0, :3], stamp_ns=stamp_ns)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Protocol
+from typing import Protocol, cast
 
 from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import Buffer, CdrReader
@@ -49,8 +49,7 @@ def _input_type(name: str) -> str:
         if name == input_type or full_name == message_type:
             return input_type
     known = ", ".join(f"{input_type} ({message_type})" for input_type, message_type in INPUT_TYPES.items())
-    msg = f"wanted an input type, got {name!r}; there are {known}"
-    raise DecodeError(msg)
+    raise DecodeError(f"wanted an input type, got {name!r}; there are {known}")
 
 
 def decoder_for(name: str, *, definition: str | None = None) -> Decoder:
@@ -67,8 +66,7 @@ def decoder_for(name: str, *, definition: str | None = None) -> Decoder:
 
 def encoder_for(name: str) -> Encoder:
     """The encoder of an input type or of a message type's name; raises `DecodeError` for any other name."""
-    encoder: Encoder = _CODECS[_input_type(name)].to_bytes
-    return encoder
+    return cast("Encoder", _CODECS[_input_type(name)].to_bytes)
 
 
 def frame_id_of(data: Buffer, input_type: str) -> str:

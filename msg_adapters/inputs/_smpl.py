@@ -33,12 +33,10 @@ def parse_layout(definition: str) -> Layout:
     Raises `DecodeError` for a definition that is more than a header and fixed float arrays, or lacks a needed one.
     """
     own = definition.split("\n====", maxsplit=1)[0]
-    lines = [line.split("#", maxsplit=1)[0].strip() for line in own.splitlines()]
-    lines = [line for line in lines if line]
+    lines = [*filter(None, (line.split("#", maxsplit=1)[0].strip() for line in own.splitlines()))]
     with decoding(MESSAGE_TYPE):
         if not lines or not _HEADER.fullmatch(lines[0]):
-            msg = f"wanted a definition that starts with 'std_msgs/Header header', got {lines[:1]}"
-            raise DecodeError(msg)
+            raise DecodeError(f"wanted a definition that starts with 'std_msgs/Header header', got {lines[:1]}")
         layout = []
         for line in lines[1:]:
             field = _ARRAY.fullmatch(line)
@@ -49,8 +47,7 @@ def parse_layout(definition: str) -> Layout:
         sizes = {name: size for name, _, size in layout}
         for name, size in _SIZES.items():
             if sizes.get(name) != size:
-                msg = f"wanted {name}[{size}] in the definition, got {sizes.get(name, 'no such field')}"
-                raise DecodeError(msg)
+                raise DecodeError(f"wanted {name}[{size}] in the definition, got {sizes.get(name, 'no such field')}")
     return tuple(layout)
 
 

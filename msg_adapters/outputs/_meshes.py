@@ -1,4 +1,4 @@
-"""Meshes with their triangles as indices, in CDR.
+"""Meshes with their triangles as indices, and openings of garments, in CDR.
 
 For planners: shape_msgs/Mesh and moveit_msgs/CollisionObject. For Foxglove: foxglove_msgs/SceneUpdate, a third of
 the size of a MarkerArray.
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import CdrWriter
 from msg_adapters.errors import EncodeError
-from msg_adapters.markers import MarkerMesh, finite_points, triangles
-from msg_adapters.transforms import Placement, quaternion_from_matrix
+from msg_adapters.markers import LINE_STRIP, MarkerMesh, encode_lists, finite_points, triangles
+from msg_adapters.transforms import Placement, Transform, encode_transforms, quaternion_from_matrix
 
 MESH = "shape_msgs/msg/Mesh"
 COLLISION_OBJECT = "moveit_msgs/msg/CollisionObject"
@@ -44,16 +44,9 @@ def encode_collision_object(
 ) -> bytes:
     """A `moveit_msgs/CollisionObject`, as MoveIt's planning scene takes it.
 
-    Args:
-        name: the object's id.
-        stamp_ns: time of the measurement [ns].
-        frame_id: the header's frame.
-        placement: of the object in that frame.
-        mesh: vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3), which replace those of an
-            object of that name; without a mesh the object is removed.
-        subframes: frames of the object, relative to it, by name; MoveIt plans to `<object>/<name>`.
-
-    Raises `EncodeError` for an invalid mesh.
+    `mesh` is vertices relative to the object [m], shape (V, 3), and triangles, shape (F, 3), which replace those of an
+    object of this name; without it the object is removed. `placement` is the object's in `frame_id`, `subframes` are
+    relative to the object; MoveIt plans to `<object>/<name>`. Raises `EncodeError` for an invalid mesh.
     """
     writer = CdrWriter()
     frames = subframes or {}
@@ -125,8 +118,7 @@ def encode_scene(
     for one in entities:
         mesh, vertices = one.mesh, finite_points(one.mesh.ns, one.vertices)
         if len(vertices) != mesh.n_vertices:
-            msg = f"{mesh.ns}: wanted {mesh.n_vertices} vertices, got {len(vertices)}"
-            raise EncodeError(msg)
+            raise EncodeError(f"{mesh.ns}: wanted {mesh.n_vertices} vertices, got {len(vertices)}")
         writer.fields("TssT?", one.stamp_ns, frame_id, mesh.ns, lifetime_ns, False)  # frame_locked
         writer.fields("IIIIII", *[0] * 6)  # metadata, arrows, cubes, spheres, cylinders, lines
         writer.fields("I", 1)
@@ -137,3 +129,55 @@ def encode_scene(
         writer.sequence("u4", mesh.faces.ravel())
         writer.fields("II", 0, 0)  # texts, models
     return writer.to_bytes()
+
+
+POLYGON = "geometry_msgs/msg/PolygonStamped"
+_COLOR, _WIDTH_M = (0.95, 0.55, 0.1, 1.0), 0.004
+"""Colour and width of the lines."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rim:
+    """Where one opening of a garment is, in the axes of a header's frame."""
+
+    name: str
+    """Name of the marker's namespace and of the frame: `[<person>/]<garment>/<opening>`."""
+    stamp_ns: int
+    centre: NDArray[np.float64]
+    """[m], shape (3,)."""
+    rotation: NDArray[np.float64]
+    """Columns are x, y and z of the opening, shape (3, 3): z points out of the garment."""
+    ring: NDArray[np.float64]
+    """Vertices of the rim in order [m], shape (K, 3)."""
+
+
+def encode_polygon(ring: ArrayLike, *, stamp_ns: int, frame_id: str = WORLD_FRAME) -> bytes:
+    """A `geometry_msgs/PolygonStamped` of points [m], shape (K, 3).
+
+    Raises `EncodeError` for points that aren't finite or of another shape, and a stamp that doesn't fit a ROS time.
+    """
+    writer = CdrWriter()
+    writer.fields("Ts", stamp_ns, frame_id)
+    writer.sequence("f4", finite_points("polygon", ring))
+    return writer.to_bytes()
+
+
+def encode_rims(rims: Sequence[Rim], *, frame_id: str = WORLD_FRAME, lifetime_ns: int = 0) -> bytes:
+    """A MarkerArray with one closed LINE_STRIP per rim; its pose is the opening's frame, and its points lie in that.
+
+    Raises `EncodeError` for rims that can't be drawn.
+    """
+    strips = []
+    for rim in rims:
+        with np.errstate(invalid="ignore"):  # what isn't finite is refused below
+            local = (rim.ring - rim.centre) @ rim.rotation
+        pose = [*rim.centre.tolist(), *quaternion_from_matrix(rim.rotation).tolist()]
+        strips.append((rim.name, rim.stamp_ns, pose, np.concatenate([local, local[:1]])))
+    return encode_lists(LINE_STRIP, strips, frame_id=frame_id, color=_COLOR, size=_WIDTH_M, lifetime_ns=lifetime_ns)
+
+
+def encode_frames(rims: Sequence[Rim], *, frame_id: str = WORLD_FRAME) -> bytes:
+    """A `tf2_msgs/TFMessage` with one frame per rim. Raises `EncodeError` for a stamp that doesn't fit a ROS time."""
+    return encode_transforms(
+        [Transform(rim.stamp_ns, frame_id, rim.name, rim.centre, quaternion_from_matrix(rim.rotation)) for rim in rims]
+    )

@@ -94,8 +94,7 @@ class PointCloudEncoder:
         for part, array in zip(self._slices, arrays, strict=True):
             values = np.asarray(array)
             if values.shape != target[part].shape:
-                msg = f"{what}: wanted numbers of shape {target[part].shape}, got {values.shape}"
-                raise EncodeError(msg)
+                raise EncodeError(f"{what}: wanted numbers of shape {target[part].shape}, got {values.shape}")
             with np.errstate(invalid="ignore", over="ignore"):
                 if values.ndim == 1:
                     target[part] = values
@@ -105,20 +104,16 @@ class PointCloudEncoder:
                 is_finite = np.isfinite(values.sum() + offset.sum())
             if not (is_finite or np.isfinite(target[part]).all()):
                 bad = int(np.count_nonzero(~np.isfinite(target[part])))
-                msg = f"{what}: {bad} of {values.size} are NaN or infinite"
-                raise EncodeError(msg)
+                raise EncodeError(f"{what}: {bad} of {values.size} are NaN or infinite")
 
 
 def _layout(fields: Sequence[str], *, most_vertices: int) -> np.dtype[Any]:
     """A point's dtype: numbers of four bytes come first, so that all lie at multiples of their size."""
-    columns = [(name, "<f4") for name in "xyz"]
-    if "normal" in fields:
-        columns += [(f"normal_{axis}", "<f4") for axis in "xyz"]
-    columns += [(name, "<f4") for name in ("clearance", "sigma") if name in fields]
-    if "vertex" in fields:
-        columns.append(("vertex", "<u2" if most_vertices <= 1 << 16 else "<u4"))
-    columns += [(name, "u1") for name in ("garment", "visible") if name in fields]
-    return np.dtype(columns, align=True)
+    optional = {f"normal_{axis}": "<f4" for axis in "xyz"} if "normal" in fields else {}
+    kinds = {"clearance": "<f4", "sigma": "<f4", "vertex": "<u2" if most_vertices <= 1 << 16 else "<u4"}
+    kinds |= {"garment": "u1", "visible": "u1"}
+    columns = {**dict.fromkeys("xyz", "<f4"), **optional, **{name: kinds[name] for name in kinds if name in fields}}
+    return np.dtype([*columns.items()], align=True)
 
 
 def _columns(points: NDArray[Any], first: str) -> NDArray[np.float32]:
@@ -138,8 +133,7 @@ def points_of(message: Any) -> NDArray[Any]:
     (height, width), (step, row_step) = (message.height, message.width), (message.point_step, message.row_step)
     try:
         if height > 1 and row_step < width * step:
-            msg = f"a row has {row_step}"
-            raise ValueError(msg)
+            raise ValueError(f"a row has {row_step}")
         kinds = [(_KINDS[one.datatype], (one.count,)) if one.count > 1 else _KINDS[one.datatype] for one in fields]
         places = {"names": [one.name for one in fields], "offsets": [one.offset for one in fields]}
         layout: Any = {**places, "formats": kinds, "itemsize": step}

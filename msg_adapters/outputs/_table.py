@@ -9,11 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, OK, DiagnosticStatus, encode_diagnostics
 from msg_adapters.markers import MARKER_ARRAY, SKIN, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
-from msg_adapters.outputs._meshes import MESH, SCENE_UPDATE, Entity, encode_mesh, encode_scene
-from msg_adapters.outputs._obstacles import Obstacles
+from msg_adapters.outputs._meshes import (
+    MESH,
+    POLYGON,
+    SCENE_UPDATE,
+    Entity,
+    Rim,
+    encode_frames,
+    encode_mesh,
+    encode_polygon,
+    encode_rims,
+    encode_scene,
+)
 from msg_adapters.outputs._points import POINT_CLOUD, POINT_FIELDS, PointCloudEncoder
-from msg_adapters.outputs._rims import POLYGON, Rim, encode_frames, encode_polygon, encode_rims
-from msg_adapters.outputs._topics import Apart, Layouts, Moment, Output, Together
+from msg_adapters.outputs._topics import Apart, Layouts, Moment, Obstacles, Output, Together
 from msg_adapters.transforms import TF_MESSAGE
 
 if TYPE_CHECKING:
@@ -29,26 +38,15 @@ def _token(name: str) -> str:
 
 
 def _mesh_of(one: DressedPerson, name: str) -> MarkerMesh:
-    fittings = one.fittings
-    color = fittings.colors[name]
-    return MarkerMesh(garment_namespace(name, one.person), fittings.faces[name], fittings.counts[name], color=color)
-
-
-def _body_of(one: DressedPerson) -> MarkerMesh:
-    return MarkerMesh(garment_namespace("body", one.person), *one.fittings.body, color=SKIN)
+    known, ns = one.fittings, garment_namespace(name, one.person)
+    return MarkerMesh(ns, known.faces[name], known.counts[name], color=known.colors[name])
 
 
 def _rims_of(one: DressedPerson) -> list[Rim]:
+    places = ((garment_namespace(name, one.person), rim) for name, rims in one.openings.items() for rim in rims)
     return [
-        Rim(
-            f"{garment_namespace(name, one.person)}/{opening.name}",
-            one.stamp_ns,
-            opening.centre + one.offset,
-            opening.rotation,
-            opening.ring + one.offset,
-        )
-        for name, openings in one.openings.items()
-        for opening in openings
+        Rim(f"{ns}/{rim.name}", one.stamp_ns, rim.centre + one.offset, rim.rotation, rim.ring + one.offset)
+        for ns, rim in places
     ]
 
 
@@ -82,6 +80,14 @@ def _garment_names(one: DressedPerson) -> list[str]:
     return [garment_namespace(name, one.person) for name in one.fittings.names]
 
 
+def _body_of(one: DressedPerson) -> MarkerMesh:
+    return MarkerMesh(garment_namespace(BODY, one.person), *one.fittings.body, color=SKIN)
+
+
+def _rim_names(one: DressedPerson) -> list[str]:
+    return [rim.name for rim in _rims_of(one)]
+
+
 def _encode_rims(worn: Sequence[DressedPerson], moment: Moment, _: Layouts) -> bytes:
     rims = [rim for one in worn for rim in _rims_of(one)]
     return encode_rims(rims, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
@@ -111,12 +117,8 @@ def _encode_points(layouts: Layouts, one: DressedPerson, _: Any, moment: Moment)
         (counts, moment.frame_id, tuple(fields)),
         lambda: PointCloudEncoder(counts, frame_id=moment.frame_id, fields=fields),
     )
-    ways: dict[str, Callable[[], Any]] = {
-        "normal": one.normals,
-        "clearance": one.clearance,
-        "sigma": one.sigma,
-        "visible": one.visible,
-    }
+    ways: dict[str, Callable[[], Any]] = {"normal": one.normals, "clearance": one.clearance}
+    ways |= {"sigma": one.sigma, "visible": one.visible}
     values = {name: make() for name, make in ways.items() if name in fields}
     return encoder.encode([*one.vertices.values()], stamp_ns=one.stamp_ns, offset=one.offset, values=values)
 
@@ -163,10 +165,8 @@ def make_outputs(*, tf: bool = False) -> list[Output]:
     body = _markers(lambda one: [_body_of(one)], lambda one: [one.body])
     table: list[Output] = [
         Together(GARMENTS, MARKER_ARRAY, _garment_names, garments, _delete_markers),
-        Together(BODY, MARKER_ARRAY, lambda one: [garment_namespace("body", one.person)], body, _delete_markers),
-        Together(
-            OPENINGS, MARKER_ARRAY, lambda one: [rim.name for rim in _rims_of(one)], _encode_rims, _delete_markers
-        ),
+        Together(BODY, MARKER_ARRAY, lambda one: [garment_namespace(BODY, one.person)], body, _delete_markers),
+        Together(OPENINGS, MARKER_ARRAY, _rim_names, _encode_rims, _delete_markers),
         Together("scene", SCENE_UPDATE, _garment_names, _encode_scene, _delete_entities),
         Apart(POINT_CLOUD, lambda _: [("points", None)], partial(_encode_points, Layouts())),
         Apart(DIAGNOSTIC_ARRAY, lambda _: [("contacts", None)], _encode_contacts),

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msg_adapters.markers import garment_namespace
+from msg_adapters.outputs._meshes import COLLISION_OBJECT, encode_collision_object
+from msg_adapters.transforms import Placement
 
 if TYPE_CHECKING:
     from refu_core.outputs import DressedPerson, Fittings
@@ -36,13 +38,14 @@ class Moment(NamedTuple):
 
 
 class Output:
-    """One row of the table."""
+    """One row of the table: one topic for all people, if `topics` doesn't say otherwise."""
 
+    topic: str
     message_type: str
 
-    def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:
+    def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:  # noqa: ARG002
         """Its topics for these people in these garments; None: before anything is known of the garments."""
-        raise NotImplementedError
+        return [self.topic]
 
     def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
         """What one tick sends, and where; nothing is computed for a topic that nobody wants."""
@@ -77,67 +80,54 @@ class Layouts:
         self._n_people = 0
 
 
+@dataclass
 class Together(Output):
     """One message of all people on one topic, in which each thing has a name: viewers are told which names have gone.
 
-    Args:
-        topic, message_type: of the output.
-        names: of the things of one person.
-        encode: makes one message of all people's things.
-        delete: makes the message that removes names.
+    `encode` makes the message of all people's things, `delete` the one that removes names.
     """
 
-    def __init__(
-        self,
-        topic: str,
-        message_type: str,
-        names: Callable[[DressedPerson], Sequence[str]],
-        encode: Callable[[Sequence[DressedPerson], Moment, Layouts], bytes],
-        delete: Callable[[Sequence[str], Moment], bytes],
-    ) -> None:
-        self.topic, self.message_type = topic, message_type
-        self._names, self._encode, self._delete = names, encode, delete
-        self._layouts = Layouts()
-        self._shown: dict[str, Sequence[str]] = {}
-
-    def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:  # noqa: ARG002 - one topic for all
-        return [self.topic]
+    topic: str
+    message_type: str
+    names: Callable[[DressedPerson], Sequence[str]]
+    encode: Callable[[Sequence[DressedPerson], Moment, Layouts], bytes]
+    delete: Callable[[Sequence[str], Moment], bytes]
+    layouts: Layouts = field(default_factory=Layouts)
+    shown: dict[str, Sequence[str]] = field(default_factory=dict)
 
     def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
         if not moment.watchers(self.topic):
             return
-        yield self.topic, self._encode(worn, moment, self._layouts)
+        yield self.topic, self.encode(worn, moment, self.layouts)
         for one in worn:
-            names = self._names(one)
-            left = sorted(set(self._shown.get(one.person, ())) - set(names))
-            self._shown[one.person] = names
+            names = self.names(one)
+            left = sorted(set(self.shown.get(one.person, ())) - set(names))
+            self.shown[one.person] = names
             if left:
-                yield self.topic, self._delete(left, moment)
+                yield self.topic, self.delete(left, moment)
 
     def gone(self, persons: Sequence[str], moment: Moment) -> Messages:
-        names = [name for person in persons for name in self._shown.pop(person, ())]
+        names = [name for person in persons for name in self.shown.pop(person, ())]
         if names:
-            yield self.topic, self._delete(names, moment)
+            yield self.topic, self.delete(names, moment)
 
     def forget(self) -> None:
-        self._layouts.clear()
+        self.layouts.clear()
 
 
 @dataclass
 class Apart(Output):
     """A topic for each person, and for each part of what they wear: nobody needs to be told that one has gone.
 
-    Args:
-        message_type: of the output.
-        places: topics below the person's name, each with an argument for `encode`.
-        encode: makes one message of one person.
-        slow: whether these are planners' meshes, at most `planner_rate` a second; the argument is then the garment.
+    `encode` makes one message of one person.
     """
 
     message_type: str
     places: Callable[[Fittings], Iterable[tuple[str, Any]]]
+    """Topics below the person's name, each with an argument for `encode`."""
     encode: Callable[[DressedPerson, Any, Moment], bytes]
     slow: bool = False
+    """Whether these are planners' meshes, at most `planner_rate` a second; the argument is then the garment."""
     due: dict[str, float] = field(default_factory=dict)
     """When each topic of planners' meshes is due next."""
 
@@ -168,3 +158,51 @@ def is_due(due: dict[str, float], key: str, moment: Moment) -> bool:
         return False
     due[key] = now + (1 / moment.planner_rate if moment.planner_rate else 0.0)
     return True
+
+
+class Obstacles(Output):
+    """Garments as MoveIt obstacles: each message adds a whole one, replacing the one that was there.
+
+    So it doesn't matter if a receiver has missed messages or restarted: to `move` what isn't there would be an error.
+    Garments that planners can't have are left out (`Fittings.without_planner`).
+    """
+
+    message_type = COLLISION_OBJECT
+    topic = "collision_object"
+
+    def __init__(self) -> None:
+        self._sent: dict[str, list[str]] = {}
+        self._due: dict[str, float] = {}
+
+    def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
+        if not moment.watchers(self.topic):
+            return
+        for one in worn:
+            fittings = one.fittings
+            if not all(fittings.has_planner(name) or name in fittings.without_planner for name in fittings.names):
+                return  # not before all are ready
+        for one in worn:
+            if not is_due(self._due, one.person, moment):
+                continue
+            garments = [name for name in one.fittings.names if name not in one.fittings.without_planner]
+            names = [garment_namespace(name, one.person) for name in garments]
+            yield from self._remove([name for name in self._sent.get(one.person, ()) if name not in names], moment)
+            self._sent[one.person] = names
+            for name, garment in zip(names, garments, strict=True):
+                data = encode_collision_object(
+                    name,
+                    stamp_ns=one.stamp_ns,
+                    frame_id=moment.frame_id,
+                    placement=Placement(translation=one.offset),
+                    mesh=one.solid(garment),
+                    subframes={at.name: Placement(at.rotation, at.centre) for at in one.openings[garment]},
+                )
+                yield self.topic, data
+
+    def gone(self, persons: Sequence[str], moment: Moment) -> Messages:
+        for person in persons:
+            yield from self._remove(self._sent.pop(person, ()), moment)
+
+    def _remove(self, names: Iterable[str], moment: Moment) -> Messages:
+        for name in names:
+            yield self.topic, encode_collision_object(name, stamp_ns=moment.now_ns, frame_id=moment.frame_id)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from refu_core.errors import GarmentError
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.garments import UvMap
-from refu_core.mesh import Connectivity, linked
+from refu_core.mesh import Connectivity, face_normals, linked
 
 Ints = NDArray[np.int64]
 
@@ -53,26 +53,20 @@ def components(faces: Ints, n: int) -> tuple[int, Ints]:
     return linked(np.concatenate((faces[:, :2], faces[:, 1:])), n)
 
 
-def face_normals(v: NDArray[np.float64], f: Ints) -> NDArray[np.float64]:
-    """Normals of faces, twice their area long, shape (F, 3)."""
-    found: NDArray[np.float64] = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-    return found
-
-
 def rim_vertices(f: Ints) -> Ints:
     """Vertices of edges that have only one face."""
     return np.unique(Connectivity.of(f).boundary).astype(np.int64)
 
 
-def is_ball(f: Ints) -> bool:
-    """Whether the largest piece is closed and no hole goes through it: no limb can. Cloth with two sides has holes."""
+def no_opening(f: Ints) -> str:
+    """A hint if the largest piece is closed and no hole goes through it: no limb can. Two-sided cloth has holes."""
     used, f = np.unique(f, return_inverse=True)
     f = f.reshape(-1, 3)
     _, label = components(f, len(used))
     largest = int(np.bincount(label).argmax())
     f = f[label[f[:, 0]] == largest]
     euler = int((label == largest).sum()) - len(_edges(f)[0]) + len(f)
-    return euler == 2
+    return ". It has no opening: if faces close its neck, sleeves, legs or hem, delete those" if euler == 2 else ""
 
 
 def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
@@ -103,33 +97,18 @@ def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
         mesh = SurfaceMesh(new_v, faces, uv)
 
 
+_CUTS = ("012", "032 312", "140 420", "314 034 042", "251 501", "503 253 231", "425 145 150", "035 314 542 345")
+"""Triangles that a face becomes by which of its edges (0, 1), (1, 2), (2, 0) are cut, as bits: corners are 0 to 2, cuts
+3 to 5."""
+
+
 def _split(f: Ints, middle: Ints) -> Ints:
     """Triangles, in order, of faces (F, 3) cut at `middle`: vertices on edges (0, 1), (1, 2), (2, 0), -1 for none."""
-    count = (middle >= 0).sum(1)
-    parts = [np.empty((0, 5), np.int64)]
-    rows = np.arange(len(f))
-
-    def add(which: NDArray[np.intp], *corners: Ints) -> None:
-        parts.append(np.stack((rows[which], np.full(len(which), len(parts)), *corners), 1))
-
-    add(np.flatnonzero(count == 0), *f[count == 0].T)
-    for k in range(3):
-        (a, b, c), (ab, bc, ca) = np.roll(f, -k, 1).T, np.roll(middle, -k, 1).T
-        one = np.flatnonzero((count == 1) & (ab >= 0))
-        add(one, a[one], ab[one], c[one])
-        add(one, ab[one], b[one], c[one])
-        two = np.flatnonzero((count == 2) & (ca < 0))
-        add(two, ab[two], b[two], bc[two])
-        add(two, a[two], ab[two], bc[two])
-        add(two, a[two], bc[two], c[two])
-    (a, b, c), (ab, bc, ca) = f.T, middle.T
-    three = np.flatnonzero(count == 3)
-    for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
-        add(three, *(corner[three] for corner in corners))
-    found = np.concatenate(parts)
-    # Sorted by face and by part, so that UVs, which are split separately, come out in the same order.
-    result: Ints = found[np.lexsort((found[:, 1], found[:, 0])), 2:]
-    return result
+    places, cut = np.concatenate((f, middle), 1), (middle >= 0) @ [1, 2, 4]
+    parts = [(np.flatnonzero(cut == k), [*map(int, part)]) for k, parts in enumerate(_CUTS) for part in parts.split()]
+    triangles = np.concatenate([places[rows][:, corners] for rows, corners in parts])
+    # By face, and then as listed, so that UVs, which are split separately, come out in the same order.
+    return triangles[np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")]
 
 
 def _edges(f: Ints) -> tuple[Ints, Ints]:
@@ -159,8 +138,7 @@ def _groups_of_place(v: NDArray[np.float64], extent: float) -> Ints:
     pairs = cKDTree(v[first]).query_pairs(_SAME_PLACE * extent, output_type="ndarray")
     label = linked(pairs, len(first))[1][of_cell.ravel()]
     _, first, of_group = np.unique(label, return_index=True, return_inverse=True)
-    found: Ints = first[of_group].astype(np.int64)
-    return found
+    return first[of_group].astype(np.int64)
 
 
 def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:

@@ -12,23 +12,15 @@ from numpy.typing import NDArray
 
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError, require_type
-from refu_core.fitting._clean import (
-    MAX_VERTICES,
-    clean,
-    components,
-    face_normals,
-    is_ball,
-    split_long_edges,
-    turned_over,
-)
+from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._pieces import apart, unsewn, without_bodies, without_floor
-from refu_core.fitting._place import NO_OPENING, UNITS, Place, Placing, find_places
+from refu_core.fitting._place import UNITS, Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentCard, GarmentTemplate, require_name
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, face_normals
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -103,30 +95,21 @@ def fit_garment(
 ) -> FittedGarment:
     """Makes a garment from a mesh that was made for roughly this body: it can be worn at once, without networks.
 
-    Args:
-        mesh: as `read_surface` reads it.
-        body: one of the built-in bodies, on the CPU.
-        name: the garment's name.
-        placing: what is known about the mesh's unit, axes, place and pose; by default all of it is found out.
-        details: what else is known about the garment.
-        longest_edge: longer edges are split [m].
-
-    Raises:
-        GarmentError: the mesh can't be worn; the message says why, and what to do.
+    The `mesh` is as `read_surface` reads it, the `body` one of the built-in ones, on the CPU. `placing` tells what is
+    known about the mesh's unit, axes, place and pose; by default all of it is found out. Edges longer than
+    `longest_edge` [m] are split. Raises `GarmentError` for a mesh that can't be worn, with why, and what to do.
     """
     require_type(mesh, SurfaceMesh, "a SurfaceMesh, such as read_surface gives", error=GarmentError)
     require_type(body, SmplBody, "an SmplBody, such as load_body gives", error=GarmentError)
     details = GarmentDetails() if details is None else details
     if details.held_at not in (None, *HOLDS):
-        msg = f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}"
-        raise GarmentError(msg)
+        raise GarmentError(f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}")
     require_name(name)
     if body.name not in BUILTIN_BODIES:
-        msg = (
+        raise GarmentError(
             f"a garment is cut for one of {', '.join(BUILTIN_BODIES)}, got the body {body.name}: add it for the one "
             f"that is most like it; a replay or pipeline with {body.name} as its body (--body) then wears it, too"
         )
-        raise GarmentError(msg)
     cleaned, notes = clean(mesh)
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
@@ -182,8 +165,7 @@ def _require_worn(mesh: SurfaceMesh) -> None:
     area = np.linalg.norm(normals, axis=1)
     along = np.linalg.eigvalsh(normals.T @ (normals / np.maximum(area, 1e-300)[:, None]))[-1] / area.sum()
     if along > _FLAT:
-        msg = "it is flat, as a sewing pattern is: wanted a garment as it is worn; sew and drape it first"
-        raise GarmentError(msg)
+        raise GarmentError("it is flat, as a sewing pattern is: wanted a garment as it is worn; sew and drape it first")
 
 
 class _Worn(NamedTuple):
@@ -241,15 +223,16 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
     vertices, posed = mesh.vertices, PosedBody(body, np.zeros((N_JOINTS, 3)))
     transfer = Transfer.of(vertices, mesh.faces, posed)
     weights = _few(transfer(body.weights.double().numpy(), length=_SKIN_LENGTH))
-    shapedirs = transfer(_shapedirs(body), length=_SHAPE_LENGTH)
+    shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template  # how a unit of each beta moves the skin [m]
+    of_skin = shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
+    shapedirs = transfer(of_skin, length=_SHAPE_LENGTH)
     share = (transfer.mass @ weights) / transfer.mass.sum()
     at_shoulders = share[list(_SHOULDERS)].sum() > 0.04
     held_at = details.held_at or ("shoulders" if at_shoulders else "waist")
     if details.held_at is None:
         notes.append(f"held at the {held_at}")
     if held_at == "waist" and not len(Connectivity.of(mesh.faces, len(vertices)).boundary):
-        msg = "a garment that is held at the waist needs an open rim there: its mesh is closed"
-        raise GarmentError(msg)
+        raise GarmentError("a garment that is held at the waist needs an open rim there: its mesh is closed")
     joints = tuple(int(j) for j in np.flatnonzero(weights.max(0) > _FELT))
     try:
         card = GarmentCard(details.layer, details.color, joints, held_at == "waist", (), details.provenance)
@@ -267,13 +250,6 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
         uv=mesh.uv,
     )
     return FittedGarment(template, notes, worn.warnings)
-
-
-def _shapedirs(body: SmplBody) -> F64:
-    """Displacements of the body's vertices per unit of each beta [m], shape (N, 30)."""
-    shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template
-    found: F64 = shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
-    return found
 
 
 def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
@@ -298,8 +274,7 @@ def _unposed(mesh: SurfaceMesh, posed: PosedBody) -> F64:
     weights = torch.from_numpy(_few(transfer(posed.body.weights.double().numpy(), length=_SKIN_LENGTH)))
     transforms = type(posed.transforms)(*(part.double() for part in posed.transforms))
     points = torch.from_numpy(mesh.vertices)[None]
-    found: F64 = unapply_transforms(points, blend_transforms(weights, transforms))[0].numpy()
-    return found
+    return unapply_transforms(points, blend_transforms(weights, transforms))[0].numpy()
 
 
 def _few(weights: F64) -> F64:
@@ -322,12 +297,11 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     deep = float((distance < -_DEEP).mean())
     if deep > _MOST_DEEP:
         near = _near(v[distance < -_DEEP], body)
-        msg = (
+        raise GarmentError(
             f"{100 * deep:.0f} % of the garment is more than {1e3 * _DEEP:.0f} mm inside the body {body.body.name}, "
             f"most of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
+            f"{no_opening(mesh.faces)}"
         )
-        msg += NO_OPENING if is_ball(mesh.faces) else ""
-        raise GarmentError(msg)
     for _ in range(_ROUNDS):
         lift = _shortfall(v, body)
         middles = _shortfall(v[edges].mean(1), body)
@@ -342,12 +316,11 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     moved = np.linalg.norm(v - start, axis=1)
     if (moved > _FARTHEST).mean() > _MOST_FAR or moved.max() > 2 * _FARTHEST:
         near = _near(v[moved > _FARTHEST], body)
-        msg = (
+        raise GarmentError(
             f"to be outside the body {body.body.name} the garment had to move by {1e3 * moved.max():.0f} mm near the "
             f"{near}: it was made for another body or pose; say its --pose or --up, or try another --body"
+            f"{no_opening(mesh.faces)}"
         )
-        msg += NO_OPENING if is_ball(mesh.faces) else ""
-        raise GarmentError(msg)
     if moved.max() > 1e-3:
         notes.append(
             f"{100 * float((moved > 1e-3).mean()):.0f} % of the vertices were brought {1e3 * CLEARANCE:.0f} mm off the "

@@ -72,43 +72,36 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
     content = read_file(source, most=_MAX_FILE_BYTES, error=GarmentError, wanted="a garment's mesh")
     try:
         if suffix == ".gltf" and b'"uri"' in content and b'"data:' not in content:
-            msg = "its numbers are in a file beside it; save it as one file, .glb"
-            raise ValueError(msg)
+            raise ValueError("its numbers are in a file beside it; save it as one file, .glb")
         with np.errstate(all="ignore"):  # numbers that aren't finite are refused below
             mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
         _require_few(len(mesh.faces))
     except ImportError:
         raise
     except Exception as error:  # trimesh may raise anything for a damaged file
-        msg = f"{source}: not a mesh that can be read: {error or type(error).__name__}"
-        raise GarmentError(msg) from error
+        raise GarmentError(f"{source}: not a mesh that can be read: {error or type(error).__name__}") from error
     return mesh
 
 
 def _require_few(n_triangles: int) -> None:
     if n_triangles > _MAX_FACES:
-        msg = f"it has {n_triangles} triangles or more, at most {_MAX_FACES} are read: decimate it"
-        raise ValueError(msg)
+        raise ValueError(f"it has {n_triangles} triangles or more, at most {_MAX_FACES} are read: decimate it")
 
 
 def _check(mesh: SurfaceMesh) -> None:
     v, f = mesh.vertices, mesh.faces
     if not len(f):
-        msg = "it has no faces"
-        raise ValueError(msg)
+        raise ValueError("it has no faces")
     if f.min() < 0 or f.max() >= len(v):
-        msg = f"a face names vertex {f.max() + 1} of {len(v)}"
-        raise ValueError(msg)
+        raise ValueError(f"a face names vertex {f.max() + 1} of {len(v)}")
     if not np.isfinite(v[f]).all():
-        msg = "it has vertices that are NaN or infinite"
-        raise ValueError(msg)
+        raise ValueError("it has vertices that are NaN or infinite")
     largest, extent = float(np.abs(v[f]).max()), float(np.ptp(v[f].reshape(-1, 3), axis=0).max())
     if largest > _SIZES[1] or extent < _SIZES[0]:
         msg = f"it is {extent:.3g} large and reaches to {largest:.3g}: wanted sizes from {_SIZES[0]:g} to {_SIZES[1]:g}"
         raise ValueError(msg)
     if mesh.uv is not None and (mesh.uv.faces.min() < 0 or mesh.uv.faces.max() >= len(mesh.uv.coordinates)):
-        msg = "a face names texture coordinates that there aren't"
-        raise ValueError(msg)
+        raise ValueError("a face names texture coordinates that there aren't")
 
 
 def _parse_obj(content: bytes) -> SurfaceMesh:
@@ -130,8 +123,7 @@ def _parse_obj(content: bytes) -> SurfaceMesh:
                 corners.append([_corner(word, len(vertices), len(coordinates)) for word in words])
                 count += max(0, len(words) - 2)
         except (ValueError, IndexError) as error:
-            msg = f"line {number}: {line[:60]!r}"
-            raise ValueError(msg) from error
+            raise ValueError(f"line {number}: {line[:60]!r}") from error
         _require_few(count)
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     triangles = _triangles(corners, points)
@@ -159,8 +151,7 @@ def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64
     """Polygons as triangles, in order, (T, 3, 2): quads are cut along the shorter diagonal, others by ears."""
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     if len(sizes) and sizes.max() > _MAX_CORNERS:
-        msg = f"a polygon of {sizes.max()} corners, at most {_MAX_CORNERS} are read: triangulate it"
-        raise ValueError(msg)
+        raise ValueError(f"a polygon of {sizes.max()} corners, at most {_MAX_CORNERS} are read: triangulate it")
     known = np.array([max((corner[0] for corner in polygon), default=0) < len(points) for polygon in polygons], bool)
     # For each triangle, the number of its polygon, and its corners.
     found = [(np.flatnonzero(sizes == 3), np.array([p for p in polygons if len(p) == 3], np.int64).reshape(-1, 3, 2))]
@@ -228,8 +219,7 @@ def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
     scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], process=False)
     parts = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     if not parts:
-        msg = "it has no faces"
-        raise ValueError(msg)
+        raise ValueError("it has no faces")
     counts = [len(part.vertices) for part in parts]
     starts = np.cumsum(counts) - counts
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])

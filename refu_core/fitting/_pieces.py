@@ -10,11 +10,12 @@ from scipy.spatial import cKDTree
 
 from refu_core.body import JOINT_NAMES
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import components, face_normals, rim_vertices
+from refu_core.fitting._clean import components, rim_vertices
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._surround import sample
 from refu_core.frames import N_JOINTS
+from refu_core.mesh import face_normals
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]

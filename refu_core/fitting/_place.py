@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import is_ball
+from refu_core.fitting._clean import no_opening
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, parts_legs, sample
@@ -87,8 +87,7 @@ class Placing:
             msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
             raise GarmentError(msg)
         if self.pose is not None and not (np.shape(self.pose) == (N_JOINTS, 3) and np.isfinite(self.pose).all()):
-            msg = f"wanted a pose of {N_JOINTS} finite rotation vectors, got {self.pose!r}"
-            raise GarmentError(msg)
+            raise GarmentError(f"wanted a pose of {N_JOINTS} finite rotation vectors, got {self.pose!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +134,6 @@ class Place:
         return found
 
 
-NO_OPENING = ". It has no opening: if faces close its neck, sleeves, legs or hem, delete those"
 _UNDER_ARMS = 0.1
 """How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
 _HAT = 0.3
@@ -226,14 +224,11 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         msg = "it reaches higher than it can: between the arms, where it is held at the waist, or far above the head; "
         raise GarmentError(msg + "say its --unit or --up, or place it on the body first")
     fit = min((one.fit for one in tiers), key=lambda fit: fit.cost)
-    msg = (
+    raise GarmentError(
         f"the mesh doesn't surround the body {body.name}: at best {100 * fit.inside:.0f} % of it is inside, it is "
         f"{1e3 * fit.distance:.0f} mm off, and {100 * fit.facing:.0f} % faces outward; say its --unit, --up or --pose, "
-        "or place it on the body first"
+        f"or place it on the body first{no_opening(mesh.faces)}"
     )
-    if is_ball(mesh.faces):
-        msg += NO_OPENING
-    raise GarmentError(msg)
 
 
 class _Search:

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody
-from refu_core.fitting._clean import components, face_normals, rim_vertices
+from refu_core.fitting._clean import components, rim_vertices
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
+from refu_core.mesh import face_normals
 
 F64 = NDArray[np.float64]
 

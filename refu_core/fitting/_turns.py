@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.fitting._clean import face_normals
 from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.mesh import face_normals
 
 F64 = NDArray[np.float64]
 

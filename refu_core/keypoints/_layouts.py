@@ -101,8 +101,7 @@ class KeypointLayout:
 def keypoint_layout(name: str) -> KeypointLayout:
     """A layout of `LAYOUTS`. Raises `RefuError` for another name."""
     if name not in _NAMES:
-        msg = f"no layout of keypoints {name!r}: wanted {', '.join(LAYOUTS)}"
-        raise RefuError(msg)
+        raise RefuError(f"no layout of keypoints {name!r}: wanted {', '.join(LAYOUTS)}")
     return layout_of(name, tuple(_NAMES[name].split()))
 
 

@@ -52,8 +52,7 @@ class Proportions:
         """The proportions of a built-in body. Raises `BodyError`."""
         keys = ("v_template", "J_regressor", "shapedirs")
         if name not in BUILTIN_BODIES:
-            msg = f"no built-in body {name!r}: wanted one of {', '.join(BUILTIN_BODIES)}"
-            raise BodyError(msg)
+            raise BodyError(f"no built-in body {name!r}: wanted one of {', '.join(BUILTIN_BODIES)}")
         with resources.as_file(resources.files("refu_core") / "assets" / f"body_{name}.npz") as path:
             data = read_npz(path, keys=keys, error=BodyError, wanted="a body model")
         regressor = np.asarray(data["J_regressor"], np.float64)
@@ -71,8 +70,7 @@ class Proportions:
 
     def of(self, betas: Array) -> Array:
         """Joints in the T-pose [m], shape (24, 3), for betas (10,)."""
-        joints: Array = self.joints + self.shapedirs @ betas
-        return joints
+        return self.joints + self.shapedirs @ betas
 
 
 class Posed(NamedTuple):
@@ -128,8 +126,7 @@ class Skeleton:
 
     def bones(self, betas: Array) -> Array:
         """The vector from each joint's parent to it in the T-pose [m], shape (24, 3)."""
-        bones: Array = self._bones[:, :, 0] + self._bones[:, :, 1:] @ betas
-        return bones
+        return self._bones[:, :, 0] + self._bones[:, :, 1:] @ betas
 
     def posed(self, pose: Pose) -> Posed:
         """Joints and keypoints of a pose; those of the last pose are remembered."""
@@ -165,8 +162,7 @@ class Skeleton:
 
 def exp_so3(vectors: Array) -> Array:
     """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) [rad]."""
-    matrices: Array = Rotation.from_rotvec(vectors).as_matrix()
-    return matrices
+    return Rotation.from_rotvec(vectors).as_matrix()
 
 
 def log_so3(matrices: Array) -> Array:

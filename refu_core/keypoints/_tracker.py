@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
-from refu_core.keypoints._guess import first_pose
 from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
-from refu_core.keypoints._settings import DEFAULTS, TrackerSettings
-from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, Solver
+from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, Solver, TrackerSettings, first_pose
 
 Array = NDArray[np.float64]
+
+DEFAULTS = TrackerSettings()
 
 
 class _Seen(NamedTuple):
@@ -57,15 +57,11 @@ class KeypointTracker:
 
     def reset(self) -> None:
         """Forgets the person."""
-        self._pose: Pose | None = None
+        self._is_here = False
         self._sent_betas: Array | None = None
         self._stamp = self._seen_at = 0
         self._noise = self._settings.noise
         self._swapped_for = self._unfit_for = 0.0
-
-    def _neutral(self) -> Pose:
-        betas = np.zeros(N_BETAS) if self._known is None else self._known
-        return Pose(np.zeros(3), exp_so3(np.where(SPREAD < 10, MEAN, 0.0)), betas)
 
     # A frame --------------------------------------------------------------------------------------
 
@@ -84,15 +80,14 @@ class KeypointTracker:
             confidence: from 0 to 1, shape (K,); NaN and negative numbers count as 0. In a frame that has one above 2,
                 all are out of 100.
 
-        Raises:
-            FrameError: another number of keypoints, or values that aren't numbers.
+        Raises `FrameError`: another number of keypoints, or values that aren't numbers.
         """
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
         dt = 1e-9 * (stamp_ns - self._stamp)
-        if self._pose is not None and not -1.0 < dt <= 1.0:
+        if self._is_here and not -1.0 < dt <= 1.0:
             self.reset()
-        if self._pose is None:
+        if not self._is_here:
             return self._begin(seen, stamp_ns)
         if dt <= 0:
             return self.at(self._stamp)
@@ -115,21 +110,16 @@ class KeypointTracker:
 
         None if nobody was seen for `hold`.
         """
-        if self._pose is None or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
+        if not self._is_here or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None
         coast = self._settings.coast
         ahead = coast * (1 - math.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
         pose = self._pose.moved(ahead * self._rate) if ahead else self._pose
-        betas = self._steady_betas(pose.betas)
+        if self._sent_betas is None or np.abs(pose.betas - self._sent_betas).max() > self._settings.beta_step:
+            self._sent_betas = pose.betas.copy()
+        betas = self._sent_betas
         transl = pose.pelvis - self.skeleton.proportions.of(betas)[0]
-        return SmplFrame(
-            log_so3(pose.turns).astype(np.float32), betas=betas.astype(np.float32), transl=transl, stamp_ns=stamp_ns
-        )
-
-    def _steady_betas(self, betas: Array) -> Array:
-        if self._sent_betas is None or np.abs(betas - self._sent_betas).max() > self._settings.beta_step:
-            self._sent_betas = betas.copy()
-        return self._sent_betas
+        return SmplFrame(log_so3(pose.turns), betas, transl, stamp_ns=stamp_ns)
 
     def _cleaned(self, points: ArrayLike, confidence: ArrayLike | None) -> _Seen:
         n = len(self.skeleton.layout)
@@ -137,8 +127,7 @@ class KeypointTracker:
             given = np.asarray(points, np.float64)
             weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
         except (TypeError, ValueError) as error:
-            msg = f"wanted {n} keypoints of {self.skeleton.layout.name} as numbers: {error}"
-            raise FrameError(msg) from error
+            raise FrameError(f"wanted {n} keypoints of {self.skeleton.layout.name} as numbers: {error}") from error
         if given.shape != (n, 3) or weights.shape != (n,):
             msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"
             raise FrameError(msg)
@@ -161,10 +150,11 @@ class KeypointTracker:
 
     def _guessed(self, seen: _Seen) -> tuple[Pose, Array, float] | None:
         """The pose, its variances, and how badly it fits [m], from one frame alone, left and right as they fit best."""
-        found = []
-        other = self.skeleton.layout.mirrored
+        found, other = [], self.skeleton.layout.mirrored
+        betas = np.zeros(N_BETAS) if self._known is None else self._known
+        neutral = Pose(np.zeros(3), exp_so3(np.where(SPREAD < 10, MEAN, 0.0)), betas)
         for sides in (seen, _Seen(seen.points[other], seen.weights[other])):
-            pose = first_pose(self.skeleton, sides.points, sides.weights > 0, self._neutral())
+            pose = first_pose(self.skeleton, sides.points, sides.weights > 0, neutral)
             if pose is not None:
                 solved = self._solved(pose, sides, prior=None, rest=1.0, steps=8)
                 found.append((solved.pose, solved.variance, self._misfit(solved.pose, sides)))
@@ -176,7 +166,7 @@ class KeypointTracker:
         return found[1] if len(found) == 2 and found[1][2] < 0.5 * found[0][2] else found[0]
 
     def _take(self, pose: Pose, variance: Array, _: float) -> None:
-        self._pose = pose
+        self._is_here, self._pose = True, pose
         self._rate = np.zeros(N_PARTS)
         self._variance = variance
         self._mixed = np.zeros(N_PARTS)
@@ -185,7 +175,6 @@ class KeypointTracker:
 
     def _begin_again(self, seen: _Seen) -> None:
         """Starts again from this frame alone if that fits better, once the pose hasn't fitted for long."""
-        assert self._pose is not None
         self._unfit_for = 0.0
         guess = self._guessed(seen)
         if guess is not None and guess[2] < 0.7 * self._misfit(self._pose, seen):
@@ -201,7 +190,6 @@ class KeypointTracker:
 
         If all keypoints are near where they were expected, nothing is changed.
         """
-        assert self._pose is not None
         expected = self.skeleton.posed(self._pose).points
         off = np.square(seen.points - expected).sum(axis=1)
         visible = seen.weights > 0
@@ -229,7 +217,6 @@ class KeypointTracker:
 
     def _predict(self, dt: float) -> None:
         """Moves the pose on by rates that die away, and the variances with it."""
-        assert self._pose is not None
         own = self._settings
         keep = math.exp(-dt / own.coast)
         ahead = own.coast * (1 - keep)
@@ -242,24 +229,20 @@ class KeypointTracker:
         self._rate = keep * self._rate
 
     def _correct(self, seen: _Seen, dt: float) -> None:
-        assert self._pose is not None
         rest = min(1.0, dt / self._settings.rest_after)
-        after, variance, step = self._solved(
-            self._pose, seen, prior=1 / self._variance, rest=rest, steps=self._settings.steps
-        )
+        prior, steps = 1 / self._variance, self._settings.steps
+        after, variance, step = self._solved(self._pose, seen, prior=prior, rest=rest, steps=steps)
         gain = self._mixed / self._variance
         shrunk = 1 - variance / self._variance
         self._rate = np.minimum(np.maximum(self._rate + gain * step, -_FASTEST), _FASTEST)
         self._rate_variance = np.maximum(self._rate_variance - gain * self._mixed * shrunk, 0.0)
         self._mixed = gain * variance
-        self._variance = variance
-        self._pose = after
+        self._variance, self._pose = variance, after
         self._seen_at = self._stamp
         self._learn_noise(seen, dt)
 
     def _learn_noise(self, seen: _Seen, dt: float) -> None:
         """Adapts to the tracker's noise, by the median distance that is left after the fit."""
-        assert self._pose is not None
         off = self.skeleton.posed(self._pose).points - seen.points
         squared = np.sort(np.einsum("ki,ki->k", off, off)[seen.weights > 0])
         if len(squared) < 4:

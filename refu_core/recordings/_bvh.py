@@ -72,18 +72,17 @@ def read_bvh(
         rate = check_fps(fps if fps is not None else 1 / seconds if seconds > 0 else 0.0)
         return _fitted(joints, _placed(joints, rows), rate, axes, worn)
     except ValueError as cause:
-        msg = f"{path}: {cause}"
-        raise error(msg) from cause
+        raise error(f"{path}: {cause}") from cause
 
 
 def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     """The joints, one row of channels per frame, and the seconds between frames. Raises `ValueError`."""
     hierarchy, word, motion = text.partition("MOTION")
-    hierarchy = re.sub(r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)", _one_word, hierarchy)
+    names = r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)"
+    hierarchy = re.sub(names, lambda match: match[1] + re.sub(r"\s+", "_", match[2]), hierarchy)
     head = re.match(r"\s*Frames:\s*(\d+)\s+Frame\s+Time:\s*([-+.\deE]+)", motion) if word else None
     if head is None:
-        msg = "not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:"
-        raise ValueError(msg)
+        raise ValueError("not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:")
     joints = _joints(iter(hierarchy.split()))
     n_channels, count = sum(len(joint.channels) for joint in joints), int(head[1])
     numbers = np.array(motion[head.end() :].split(), dtype=np.float64)
@@ -92,10 +91,6 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
         msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
         raise ValueError(msg)
     return joints, numbers.reshape(count, n_channels), float(head[2])
-
-
-def _one_word(match: re.Match[str]) -> str:
-    return match[1] + re.sub(r"\s+", "_", match[2])
 
 
 def _joints(words: Iterator[str]) -> list[_Joint]:
@@ -115,18 +110,14 @@ def _joints(words: Iterator[str]) -> list[_Joint]:
             elif word == "CHANNELS":
                 joints[open_[-1]].channels = [next(words).lower() for _ in range(int(next(words)))]
             if len(joints) > _MAX_JOINTS:
-                msg = f"more than {_MAX_JOINTS} joints"
-                raise ValueError(msg)
+                raise ValueError(f"more than {_MAX_JOINTS} joints")
     except (StopIteration, IndexError) as cause:
-        msg = "its hierarchy is cut short"
-        raise ValueError(msg) from cause
+        raise ValueError("its hierarchy is cut short") from cause
     if open_:
-        msg = f"its hierarchy is cut short: {len(open_)} braces are never closed"
-        raise ValueError(msg)
+        raise ValueError(f"its hierarchy is cut short: {len(open_)} braces are never closed")
     unknown = [name for joint in joints for name in joint.channels if name not in _CHANNELS]
     if not joints or unknown:
-        msg = f"unknown channel {unknown[0]!r}" if unknown else "no joints"
-        raise ValueError(msg)
+        raise ValueError(f"unknown channel {unknown[0]!r}" if unknown else "no joints")
     return joints
 
 
@@ -148,8 +139,7 @@ def _placed(joints: list[_Joint], rows: Array) -> Array:
         if order and len(set(order)) == len(order):
             turn = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True).as_matrix()
         elif order:
-            msg = f"{joint.name} turns twice about one axis: {order}"
-            raise ValueError(msg)
+            raise ValueError(f"{joint.name} turns twice about one axis: {order}")
         else:
             turn = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
         if joint.parent < 0:
@@ -167,8 +157,7 @@ def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: P
     missing = [name for name in _NEEDED if name not in points]
     if missing:
         names = ", ".join(joint.name for joint in joints[:12] if joint.name)
-        msg = f"not a person's skeleton, or its names aren't known: no {', '.join(missing)} among {names} …"
-        raise ValueError(msg)
+        raise ValueError(f"not a person's skeleton, or its names aren't known: no {', '.join(missing)} among {names} …")
     notes: list[str] = []
     scale = metres_of(list(points), places[0, list(points.values())], notes)
     seen = scale * places[:, list(points.values())]
@@ -188,10 +177,8 @@ def _points(joints: list[_Joint], places: Array) -> dict[str, int]:
     for part, names in _NAMES.items():
         for side in ("l", "r") if part in _SIDED else ("",):
             taken = points.values()
-            found = next(
-                (at for name in names if (at := sides.get((side, name))) is not None and at not in taken), None
-            )
-            if found is not None:
+            named = (sides.get((side, name)) for name in names)
+            if (found := next((at for at in named if at is not None and at not in taken), None)) is not None:
                 points[f"{side}_{part}" if side else part] = found
     if "pelvis" not in points and (pelvis := _between(joints, places, points)) is not None:
         points["pelvis"] = pelvis

@@ -22,16 +22,8 @@ from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz, 
 from refu_core._pickle import PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, bytes_of, read_stream
 from refu_core.errors import RefuError
-from refu_core.recordings._layouts import (
-    ALL_KEYS,
-    GENDERS,
-    JSON_ADVICE,
-    POSE_KEYS,
-    SUFFIXES,
-    WANTED,
-    is_like_column,
-    is_like_known,
-)
+from refu_core.recordings import _layouts as table
+from refu_core.recordings._layouts import WANTED
 
 Key = str | int
 _ZIP, _NPY = b"PK\x03\x04", b"\x93NUMPY"
@@ -76,8 +68,7 @@ class Content:
         if _is_list(value):  # a shared list is converted once, but counts each time it is seen
             self._left -= len(value) if known is None else known[1].size
         if depth > MOST_DEPTH or self._left < 0:
-            msg = f"lists of lists, more than {MOST_DEPTH} deep or of more than {_MOST_ITEMS} items"
-            raise ValueError(msg)
+            raise ValueError(f"lists of lists, more than {MOST_DEPTH} deep or of more than {_MOST_ITEMS} items")
         if known is not None:
             return known[1]
         try:
@@ -85,8 +76,7 @@ class Content:
                 rows = [self._array(item, depth + 1) for item in value]
                 shapes = sorted({row.shape for row in rows})
                 if len(shapes) > 1:
-                    msg = f"a list of arrays of several shapes: {', '.join(map(str, shapes[:4]))}"
-                    raise ValueError(msg)
+                    raise ValueError(f"a list of arrays of several shapes: {', '.join(map(str, shapes[:4]))}")
                 array = np.stack(rows)
             else:
                 array = self._arrays.of(value)
@@ -121,10 +111,6 @@ class Content:
                 yield path, inside
             if len(path) < MOST_DEPTH and len(todo) < _MOST_NODES:
                 todo += [((*path, key), item) for key, item in inside.items() if entries(item) is not None]
-
-    def renamed(self, names: Mapping[Key, Key]) -> Content:
-        """The same content with keys renamed, wherever they occur."""
-        return self.changed(lambda node: {names.get(key, key): item for key, item in node.items()})
 
     def changed(self, change: Callable[[Mapping[Key, Any]], Mapping[Key, Any]]) -> Content:
         """The same content with every mapping changed, and then the mappings in it; a shared one is changed once."""
@@ -209,21 +195,20 @@ def open_content(path: Path, *, error: type[RefuError]) -> Content:
                 return Content(root, storage)
             return Content(root)
         except DAMAGE as cause:
-            is_other = path.suffix and path.suffix.lower() not in SUFFIXES
+            is_other = path.suffix and path.suffix.lower() not in table.SUFFIXES
             why = f"no file of motion is a {path.suffix}" if is_other else told(cause)
-            hint = JSON_ADVICE if path.suffix.lower() == ".json" else ""
-            msg = f"{path}: can't be read: {why}; wanted {WANTED}{hint}"
-            raise error(msg) from cause
+            hint = table.JSON_ADVICE if path.suffix.lower() == ".json" else ""
+            raise error(f"{path}: can't be read: {why}; wanted {WANTED}{hint}") from cause
 
 
 def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
-    wanted = {name for name in names if _steps(name)[-1] in ALL_KEYS}
-    if not any(_steps(name)[-1] in POSE_KEYS for name in names):
+    wanted = {name for name in names if _steps(name)[-1] in table.ALL_KEYS}
+    if not any(_steps(name)[-1] in table.POSE_KEYS for name in names):
         for name in names:  # a dictionary that NumPy has pickled into an array
             held = _object(path, name)
             if held is not None:
                 return Content({**_arrays(path, wanted, error), name: held})
-        wanted |= {name for name in names if is_like_known(_steps(name)[-1])}
+        wanted |= {name for name in names if table.spelled(_steps(name)[-1]).endswith(table.KNOWN_WORDS)}
     arrays = _arrays(path, wanted, error)
     root: dict[Key, Any] = dict.fromkeys(name for name in names if name not in arrays)
     for name, array in arrays.items():
@@ -238,10 +223,10 @@ def _npz(path: Path, names: list[str], error: type[RefuError]) -> Content:
 
 def _arrays(path: Path, names: set[str], error: type[RefuError]) -> dict[str, NDArray[Any]]:
     """The arrays of these names; of those named like columns, only what is one. Raises `error` for damaged ones."""
-    like = {name for name in names if is_like_column(_steps(name)[-1])}
+    like = {name for name in names if table.spelled(_steps(name)[-1]).endswith(table.COLUMN_WORDS)}
     columns = _columns(path, like, error)
     # A gender that isn't one mustn't be overlooked.
-    apart = {name for name in like if name in columns or _steps(name)[-1] not in GENDERS}
+    apart = {name for name in like if name in columns or _steps(name)[-1] not in table.GENDERS}
     return read_npz(path, keys=names - apart, error=error, wanted=WANTED) | columns
 
 
@@ -263,8 +248,7 @@ def _columns(path: Path, names: Collection[str], error: type[RefuError]) -> dict
                 if shape and max(shape) == math.prod(shape) and dtype.kind in "biufUS":
                     columns[name] = npy.read_array(io.BytesIO(data), allow_pickle=False)
     except DAMAGE as cause:
-        msg = f"{path}: can't be read as .npz: {told(cause)}; wanted {WANTED}"
-        raise error(msg) from cause
+        raise error(f"{path}: can't be read as .npz: {told(cause)}; wanted {WANTED}") from cause
     return columns
 
 
@@ -303,8 +287,7 @@ def _unpacked(packed: bytes, unpacker: Any) -> bytes:
     """The unpacked data. Raises `ValueError` if it is cut short, or larger than `_MOST_HELD`."""
     unpacked: bytes = unpacker.decompress(packed, _MOST_HELD + 1)
     if not unpacker.eof or len(unpacked) > _MOST_HELD:
-        msg = f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short"
-        raise ValueError(msg)
+        raise ValueError(f"unpacks to more than {_MOST_HELD >> 20} MiB, or was cut short")
     return unpacked
 
 
@@ -322,13 +305,11 @@ def _torch(path: Path, error: type[RefuError]) -> Content:
             tree = Unpickler(io.BytesIO(_member(archive, name))).load()
         return Content(tree, storage)
     except DAMAGE as cause:
-        msg = f"{path}: can't be read as a file of torch: {told(cause)}; wanted {WANTED}"
-        raise error(msg) from cause
+        raise error(f"{path}: can't be read as a file of torch: {told(cause)}; wanted {WANTED}") from cause
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
     entry = archive.getinfo(name)
     if entry.compress_type != zipfile.ZIP_STORED or entry.file_size > MAX_PICKLE_BYTES:
-        msg = f"{name} is compressed, or has {entry.file_size >> 20} MiB"
-        raise ValueError(msg)
+        raise ValueError(f"{name} is compressed, or has {entry.file_size >> 20} MiB")
     return archive.read(entry)

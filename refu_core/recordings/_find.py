@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content, Key, entries
-from refu_core.recordings._mhr import is_of_mhr
+from refu_core.recordings._followed import is_of_mhr
 from refu_core.recordings._rotations import is_one_frame
 from refu_core.recordings._tables import told_apart
 from refu_core.recordings._tracks import frames_of
@@ -59,8 +59,7 @@ def find_motion(content: Content, person: str | None, notes: list[str]) -> tuple
         Located(layout, path, node)
         for path, node in nodes.items()
         for layout in table.LAYOUTS
-        if all(node.get(name) is not None for name in layout.pose)
-        and (layout is not table.MHR or is_of_mhr(content.array(node[layout.pose[0]])))
+        if layout.is_in(node) and (layout is not table.MHR or is_of_mhr(content.array(node[layout.pose[0]])))
     ]
     if not every:
         raise ValueError(_unknown(nodes))
@@ -124,12 +123,13 @@ def with_known_names(content: Content) -> tuple[Content, Mapping[Key, str]]:
     """The content with known names, and which were changed, where a pose's are spelled differently or have a prefix."""
     names = None
     for _, node in content.nodes():
-        exact = [one for one in table.LAYOUTS if all(node.get(name) is not None for name in one.pose)]
-        if any(one.is_whole for one in exact):
+        if any(one.is_whole and one.is_in(node) for one in table.LAYOUTS):
             return content, {}
         known = table.names_like([key for key, value in node.items() if value is not None])
         names = names or known
-    return (content.renamed(names), names) if names else (content, {})
+    if not names:
+        return content, {}
+    return content.changed(lambda node: {names.get(key, key): item for key, item in node.items()}), names
 
 
 def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
@@ -139,8 +139,7 @@ def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
         arrays: dict[Key, Any] = {"poses": array[:, :66], "trans": array[:, 309:312], "betas": array[:, 312:322]}
         return arrays | {table.MODELS[0]: "smplx"}
     if array.ndim == 2 and array.shape[1] == 263:
-        msg = f"263 columns are HumanML3D features; {table.UNREAD_ADVICE['HumanML3D features']}"
-        raise ValueError(msg)
+        raise ValueError(f"263 columns are HumanML3D features; {table.HUMANML_ADVICE}")
     return {"poses": array}
 
 
@@ -165,9 +164,9 @@ def chosen(names: Sequence[str], person: str | None, lengths: Sequence[int], not
 
 def _unknown(nodes: Mapping[tuple[Key, ...], Mapping[Key, Any]]) -> str:
     keys = list(dict.fromkeys(str(key) for node in list(nodes.values())[:_SHOWN] for key in node))
-    for what, names in table.UNREAD.items():
+    for names, what in table.UNREAD.items():
         if any(name in keys for name in names):
-            return f"{what} parameters aren't read: {table.UNREAD_ADVICE[what]}"
+            return what
     has = ", ".join(keys[:_SHOWN]) + (" …" if len(keys) > _SHOWN else "") or "nothing that has a name"
     return f"no poses; wanted {table.accepted()} (docs/guide/inputs.md); the file has {has}"
 

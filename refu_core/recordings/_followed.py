@@ -1,9 +1,13 @@
-"""Motion of a body that isn't SMPL, from the places of its points: SMPL's skeleton follows them like keypoints."""
+"""Motion of a body that isn't SMPL, from the places of its points: SMPL's skeleton follows them like keypoints.
+
+So is MHR followed, the body of SAM 3D Body: by the keypoints beside its parameters.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +31,14 @@ SMPL_POINTS = tuple(_SMPL.split())
 _BONES = (0.4, 2.5)
 """Least and greatest ratio of a bone's length to the mean body's, each taken as a share of the length of the legs."""
 _NOTHING = 1e-3
+
+N_KEYPOINTS = 70
+_MHR = "nose l_eye r_eye l_ear r_ear l_shoulder r_shoulder l_elbow r_elbow l_hip r_hip l_knee r_knee l_ankle r_ankle "
+_MHR += "l_big_toe l_small_toe l_heel r_big_toe r_small_toe r_heel"
+_PLACES = dict(zip(_MHR.split(), range(21), strict=True))
+_PLACES |= {"r_index": 28, "r_pinky": 40, "r_wrist": 41, "l_index": 49, "l_pinky": 61, "l_wrist": 62, "neck": 69}
+"""Which of MHR's 70 keypoints each point of the keypoint layouts is; on a hand the knuckles, since fingers bend."""
+MHR_POINTS = tuple(_PLACES)
 
 
 def follow(
@@ -52,8 +64,7 @@ def follow(
     shapes = [KeypointTracker(skeleton, settings=_SETTINGS).update(places[i], 0) for i in some]
     known = [frame.betas for frame in shapes if frame is not None]
     if not known:
-        msg = "its joints are in no order that a person's are in"
-        raise ValueError(msg)
+        raise ValueError("its joints are in no order that a person's are in")
     betas = np.median(known, axis=0)
     track = KeypointTracker(skeleton, betas=betas, settings=_SETTINGS)
     frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
@@ -98,8 +109,7 @@ def metres_of(points: Sequence[str], places: NDArray[np.float64], notes: list[st
     leg = sum(float(np.linalg.norm(at[a] - at[b])) for a, b in pairwise(ends))
     leg *= 1.0 if len(ends) == 3 else 2.0
     if not leg > 0:
-        msg = "its legs have no length"
-        raise ValueError(msg)
+        raise ValueError("its legs have no length")
     unit = min(_UNITS, key=lambda name: abs(np.log(leg * _UNITS[name] / _LEG)))
     scale = _UNITS[unit]
     if not _LEGS[0] <= leg * scale <= _LEGS[1]:
@@ -107,3 +117,26 @@ def metres_of(points: Sequence[str], places: NDArray[np.float64], notes: list[st
         return _LEG / leg
     notes.append(f"taken as {unit}: its legs are {leg * scale:.2f} m long")
     return scale
+
+
+def is_of_mhr(keypoints: NDArray[Any]) -> bool:
+    """Whether these are frames of MHR's 70 keypoints: most estimators write other ones under that name."""
+    return keypoints.dtype.kind in "iuf" and keypoints.shape[1:] in ((N_KEYPOINTS, 3), (3 * N_KEYPOINTS,))
+
+
+def places_of_mhr(
+    keypoints: NDArray[Any], place: NDArray[np.float64], at: NDArray[np.int64] | None
+) -> NDArray[np.float64]:
+    """Places of `MHR_POINTS` [m], shape (T, K, 3), NaN in frames in which the person was lost.
+
+    Args:
+        keypoints: relative to the body [m], (N, 70, 3) or (N, 210).
+        place: of the body [m], (N, 3).
+        at: which of the T frames they are, (N,); None for all.
+    """
+    seen = keypoints.reshape(-1, N_KEYPOINTS, 3).astype(np.float64)[:, list(_PLACES.values())] + place[:, None]
+    if at is None:
+        return seen
+    places = np.full((int(at[-1]) + 1, *seen.shape[1:]), np.nan)
+    places[at] = seen
+    return places

@@ -5,10 +5,11 @@ A file is recognised by the names of its arrays. How an array holds rotations is
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from refu_core.recordings._mhr import N_KEYPOINTS
+from refu_core.recordings._followed import N_KEYPOINTS
 from refu_core.recordings._rotations import BODY, WHOLE
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
@@ -44,6 +45,10 @@ class Layout:
     turns_about_origin: bool = False
     """Whether the root turns the body about the origin of its mesh instead of its pelvis."""
 
+    def is_in(self, node: Mapping[Any, Any]) -> bool:
+        """Whether a mapping has all arrays of the pose."""
+        return all(node.get(name) is not None for name in self.pose)
+
     @property
     def joints(self) -> tuple[tuple[int, ...], ...]:
         """How many joints each array may have."""
@@ -53,11 +58,7 @@ class Layout:
 
 
 MHR = Layout(
-    writers="SAM 3D Body",
-    pose=("pred_keypoints_3d",),
-    transl=("pred_cam_t",),
-    is_whole=False,
-    counts=(N_KEYPOINTS,),
+    writers="SAM 3D Body", pose=("pred_keypoints_3d",), transl=("pred_cam_t",), is_whole=False, counts=(N_KEYPOINTS,)
 )
 """Its keypoints, relative to the body, and where the body is in front of the camera [m]."""
 
@@ -78,11 +79,7 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="EMDB", pose=("poses_root", "poses_body")),
     Layout(writers="AIST++", pose=("smpl_poses",), transl=("smpl_trans",)),
     Layout(
-        writers="ROMP, BEV, TRACE",
-        pose=("smpl_thetas",),
-        transl=("cam_trans",),
-        betas=("smpl_betas",),
-        has_age=True,
+        writers="ROMP, BEV, TRACE", pose=("smpl_thetas",), transl=("cam_trans",), betas=("smpl_betas",), has_age=True
     ),
     Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",)),
     Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",)),
@@ -142,18 +139,9 @@ def spelled(key: object) -> str:
 
 
 _SPELLED = {spelled(name): name for name in sorted(ALL_KEYS)}
+KNOWN_WORDS = tuple(_SPELLED)
+COLUMN_WORDS = tuple(map(spelled, COLUMNS))
 _POSES = tuple(spelled(layout.pose[0]) for layout in LAYOUTS)
-_COLUMNS = tuple(map(spelled, COLUMNS))
-
-
-def is_like_known(key: object) -> bool:
-    """Whether a name ends with a known one, however it is spelled."""
-    return spelled(key).endswith(tuple(_SPELLED))
-
-
-def is_like_column(key: object) -> bool:
-    """Whether a name ends with a column's, however it is spelled."""
-    return spelled(key).endswith(_COLUMNS)
 
 
 def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
@@ -178,17 +166,15 @@ def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
     return {}
 
 
+HUMANML_ADVICE = "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)"
 UNREAD = {
-    "MHR (SAM 3D Body)": ("mhr_model_params", "body_pose_params", "lbs_model_params", "identity_coeffs"),
-    "HumanML3D features": ("motion_feats", "new_joint_vecs"),
-    "a body model's": ("J_regressor",),
+    ("mhr_model_params", "body_pose_params", "lbs_model_params", "identity_coeffs"): "MHR (SAM 3D Body) parameters "
+    "aren't read: save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
+    ("motion_feats", "new_joint_vecs"): f"HumanML3D features parameters aren't read: {HUMANML_ADVICE}",
+    ("J_regressor",): "a body model's parameters aren't read: it is who wears the garments, and no motion: give it as "
+    "--body (in Python: body=)",
 }
-"""What is recognised but can't be read, with the names that give it away."""
-UNREAD_ADVICE = {
-    "MHR (SAM 3D Body)": "save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
-    "HumanML3D features": "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)",
-    "a body model's": "it is who wears the garments, and no motion: give it as --body (in Python: body=)",
-}
+"""What to say of what is recognised but can't be read, by the names that give it away."""
 
 WANTED = "a motion: .npz, .npy, .pkl, .pt of an estimator or archive, or .bvh (docs/guide/inputs.md lists them)"
 
@@ -197,5 +183,4 @@ JSON_ADVICE = "; save the arrays of EasyMocap's .json as .npz, as that page show
 
 def accepted() -> str:
     """The names that a file may have its pose under, for a message."""
-    names = dict.fromkeys(" with ".join(layout.pose) for layout in LAYOUTS if "without" not in layout.writers)
-    return ", ".join(names)
+    return ", ".join(dict.fromkeys(" with ".join(one.pose) for one in LAYOUTS if "without" not in one.writers))

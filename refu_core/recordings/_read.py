@@ -16,8 +16,7 @@ from refu_core.recordings import _layouts as table
 from refu_core.recordings._bvh import read_bvh
 from refu_core.recordings._containers import Content, Key, open_content
 from refu_core.recordings._find import chosen, find_motion, first, person_of, with_known_names
-from refu_core.recordings._followed import SMPL_POINTS, are_places, follow, metres_of
-from refu_core.recordings._mhr import POINTS, places_of_mhr
+from refu_core.recordings._followed import MHR_POINTS, SMPL_POINTS, are_places, follow, metres_of, places_of_mhr
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, not_finite, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
@@ -53,8 +52,8 @@ def read_recording(
         worn: the body that will be dressed: betas are fitted to it if the file has only places of joints, and roots
             turn about its pelvis. By default a built-in body.
 
-    Raises:
-        error: the file can't be read, isn't recognised, has no frame rate, or its arrays have wrong shapes or meanings.
+    Raises `error`: the file can't be read, isn't recognised, has no frame rate, or its arrays have wrong shapes or
+    meanings.
     """
     path = Path(path)
     if axes not in AXES or not isinstance(fps, (int, float, type(None))):
@@ -63,15 +62,13 @@ def read_recording(
     person = None if person is None else str(person)
     if path.suffix.lower() == ".bvh":
         if person is not None:
-            msg = f"{path}: no person {person!r}; a BVH file has one, without a name: leave the person out"
-            raise error(msg)
+            raise error(f"{path}: no person {person!r}; a BVH file has one, without a name: leave the person out")
         return read_bvh(path, error=error, fps=fps, axes=axes, worn=worn)
     content = open_content(path, error=error)
     try:
         return _recording(content, fps=fps, axes=axes, person=person, worn=worn)
     except ValueError as cause:
-        msg = f"{path}: {cause}"
-        raise error(msg) from cause
+        raise error(f"{path}: {cause}") from cause
 
 
 def _recording(
@@ -126,7 +123,7 @@ def _recording(
         notes.append("MHR, another body than SMPL's: followed by its keypoints")
         at = places_in_time(numbers(len(array)), len(array), notes)
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
-        return follow(POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
+        return follow(MHR_POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
     if layout.holds_places or _is_of_places(arrays):
         ((name, array),) = arrays.items()
         notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
@@ -170,9 +167,8 @@ def _recording(
     tell_pace(transl, hertz, notes)
     bad = not_finite(poses, transl)
     if len(bad):
-        notes.append(
-            f"NaN or infinite in {len(bad)} of {len(poses)}, first in number {bad[0]}: nobody is dressed there"
-        )
+        where = f"{len(bad)} of {len(poses)}, first in number {bad[0]}"
+        notes.append(f"NaN or infinite in {where}: nobody is dressed there")
     gender = gender_of(word_of(content, first(above, table.GENDERS), which), notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
         return Recording(poses.astype(np.float32), transl, betas, hertz, gender, tuple(notes))
@@ -224,8 +220,7 @@ def _poses(
                 raise ValueError(msg)
             body, n = body[:, 1:], n - 1
         if len(root) != len(body):
-            msg = f"{names[0]} has {len(root)} frames, {names[1]} {len(body)}; wanted as many"
-            raise ValueError(msg)
+            raise ValueError(f"{names[0]} has {len(root)} frames, {names[1]} {len(body)}; wanted as many")
     else:
         whole, n = rotvecs_of(given[0], names[0], (*WHOLE, *BODY), notes, has_root=True)
         if n in BODY:
@@ -244,8 +239,7 @@ def _poses(
             root, body, n = whole[:, :1], whole[:, 1:], n - 1
     kept = n if n == N_JOINTS - 1 else _BODY_JOINTS - 1
     if len(body) > MAX_FRAMES:
-        msg = f"{len(body)} frames, at most {MAX_FRAMES} are read; cut the clip"
-        raise ValueError(msg)
+        raise ValueError(f"{len(body)} frames, at most {MAX_FRAMES} are read; cut the clip")
     poses = np.zeros((len(body), N_JOINTS, 3))
     poses[:, :1], poses[:, 1 : 1 + kept] = root, body[:, :kept]
     return poses, 1 + n

@@ -47,8 +47,7 @@ def check_fps(fps: float) -> float:
     """The frame rate. Raises `ValueError` for one outside `FPS_RANGE`."""
     low, high = FPS_RANGE
     if not low <= fps <= high:
-        msg = f"wanted a frame rate in [{low:g}, {high:g}], got {fps:g}; --fps says it otherwise"
-        raise ValueError(msg)
+        raise ValueError(f"wanted a frame rate in [{low:g}, {high:g}], got {fps:g}; --fps says it otherwise")
     return float(fps)
 
 

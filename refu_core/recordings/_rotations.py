@@ -37,17 +37,13 @@ def rotvecs_of(
 ) -> tuple[Array, int]:
     """Rotation vectors [rad], shape (T, n, 3), and n, one of `counts`.
 
-    Raises:
-        ValueError: another shape, quaternions, degrees, or matrices that aren't rotations.
+    Raises `ValueError`: another shape, quaternions, degrees, or matrices that aren't rotations.
     """
     size, n, frames = _form(array, name, counts)
     numbers = np.asarray(array, np.float64).reshape(frames, n, size)
     if size == 4:
-        msg = (
-            f"{name} {array.shape} looks like quaternions, whose order a file doesn't say; save rotation vectors: "
-            "scipy's Rotation.from_quat(q) takes xyzw, then .as_rotvec()"
-        )
-        raise ValueError(msg)
+        hint = "save rotation vectors: scipy's Rotation.from_quat(q) takes xyzw, then .as_rotvec()"
+        raise ValueError(f"{name} {array.shape} looks like quaternions, whose order a file doesn't say; {hint}")
     if size == 3:
         _check_radians(numbers, name)
         return numbers, n
@@ -71,8 +67,7 @@ def is_one_frame(shape: tuple[int, ...], counts: Collection[int]) -> bool:
 def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int, int, int]:
     """Numbers per joint, number of joints, number of frames."""
     if array.dtype.kind != "f":
-        msg = f"{name} must be numbers with a fraction, got {array.dtype} {array.shape}"
-        raise ValueError(msg)
+        raise ValueError(f"{name} must be numbers with a fraction, got {array.dtype} {array.shape}")
     shape = array.shape
     inner = shape[1:]
     if len(shape) > 2 and inner[0] == 1 and 1 not in counts:  # an axis of one person
@@ -89,16 +84,10 @@ def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int,
                 found.append((size, n, 1))
     if not found or not array.size:
         per, advice = " | ".join(str(n) for n in counts), _advice(shape)
-        wanted = (
-            f"rotations of n = {per} joints"
-            if advice
-            else (
-                "(T, n, 3) or (T, n*3) rotation vectors [rad], (T, n, 3, 3) or (T, n*9) matrices, or "
-                f"(T, n, 6) or (T, n*6), with T > 0 and n = {per} joints"
-            )
-        )
-        msg = f"{name} must be {wanted}, got {shape}{advice}"
-        raise ValueError(msg)
+        forms = "(T, n, 3) or (T, n*3) rotation vectors [rad], (T, n, 3, 3) or (T, n*9) matrices, "
+        forms += f"or (T, n, 6) or (T, n*6), with T > 0 and n = {per} joints"
+        wanted = f"rotations of n = {per} joints" if advice else forms
+        raise ValueError(f"{name} must be {wanted}, got {shape}{advice}")
     # (24, 3) is one frame of SMPL: for 24 frames of a root, the caller would have asked for the count 1.
     return next((form for form in found if form[0] != 4), found[0])
 
@@ -118,11 +107,8 @@ def _check_radians(vectors: Array, name: str) -> None:
         longest = np.linalg.norm(vectors, axis=-1).max(axis=1)
     longest = longest[np.isfinite(longest)]
     if longest.size and float(np.median(longest)) > LONGEST_TURN:
-        msg = (
-            f"{name} has rotation vectors as long as {np.median(longest):.0f} in most frames, wanted radians, 6.3 at "
-            "most; where they are degrees, save np.radians of them"
-        )
-        raise ValueError(msg)
+        what = f"{name} has rotation vectors as long as {np.median(longest):.0f} in most frames"
+        raise ValueError(f"{what}, wanted radians, 6.3 at most; where they are degrees, save np.radians of them")
 
 
 def _rotvecs(matrices: Array, name: str) -> Array:
@@ -139,11 +125,9 @@ def _rotvecs(matrices: Array, name: str) -> Array:
         frame, joint = bad[0]
         one = sound[frame, joint]
         what = "mirrors" if skew[frame, joint] <= _MOST_SKEW else "isn't a rotation"
-        msg = (
-            f"{name}: the matrix of joint {joint} in frame {np.flatnonzero(there)[frame]} {what} (determinant "
-            f"{np.linalg.det(one):.2g}, R Rᵀ is {skew[frame, joint]:.2g} off the identity); wanted rotations"
-        )
-        raise ValueError(msg)
+        where = f"the matrix of joint {joint} in frame {np.flatnonzero(there)[frame]}"
+        off = f"determinant {np.linalg.det(one):.2g}, R Rᵀ is {skew[frame, joint]:.2g} off the identity"
+        raise ValueError(f"{name}: {where} {what} ({off}); wanted rotations")
     if len(sound):
         flat = Rotation.from_matrix(sound.reshape(-1, 3, 3)).as_rotvec()
         result[there] = flat.reshape(*sound.shape[:2], 3)

@@ -49,8 +49,7 @@ def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]
     found: dict[str | int, Any] = {"poses": poses, **{name: root[name] for name in RATES if name in root}}
     unit = word_of(content, root.get("unit")) or "meters"
     if unit not in _METRES:
-        msg = f"unit: wanted {', '.join(_METRES)}, got {unit[:20]!r}"
-        raise ValueError(msg)
+        raise ValueError(f"unit: wanted {', '.join(_METRES)}, got {unit[:20]!r}")
     if root.get("transl") is not None:  # SOMA's is the place of the hips; SMPL's is added to the pelvis at rest
         transl = content.array(root["transl"])
         is_place = transl.dtype.kind in "iuf" and transl.shape[-1:] == (3,)

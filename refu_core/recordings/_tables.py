@@ -73,7 +73,10 @@ def _people(content: Content, node: Mapping[Key, Any], n: int, notes: list[str])
     if not persons and not folders and 1 < len(set(images)) < n <= _MOST_UNTRACKED:
         return _by_image(content, node, images)
     rows: dict[Key, list[int]] = {}
-    for i, name in enumerate(_names(folders, persons, n)):
+    names: Sequence[Key] = folders or persons or [0] * n
+    if folders and persons:
+        names = [f"{folder}/{person}" for folder, person in zip(folders, persons, strict=True)]
+    for i, name in enumerate(names):
         rows.setdefault(name, []).append(i)
     if len(rows) == 1:
         has_own = any(name in node for name in table.FRAME_NUMBERS)
@@ -81,23 +84,15 @@ def _people(content: Content, node: Mapping[Key, Any], n: int, notes: list[str])
     by = [name for name, given in (("their images' folders", folders), ("their column of persons", persons)) if given]
     notes.append(f"the rows are {len(rows)} persons', told apart by {' and '.join(by)}")
     if len(rows) > _MOST_PERSONS:
-        msg = f"{len(rows)} persons, at most {_MOST_PERSONS} are told apart; save fewer of them in a file"
-        raise ValueError(msg)
+        raise ValueError(f"{len(rows)} persons, at most {_MOST_PERSONS} are told apart; save fewer of them in a file")
     return _tracks(content, node, n, rows, numbers)
-
-
-def _names(folders: Sequence[str], persons: Sequence[Key], n: int) -> Sequence[Key]:
-    """Whose each row is."""
-    if folders and persons:
-        return [f"{folder}/{person}" for folder, person in zip(folders, persons, strict=True)]
-    return folders or persons or [0] * n
 
 
 def _n_rows(content: Content, node: Mapping[Key, Any]) -> int:
     """How many rows of one pose each a table has that has columns beside it; 0 for any other mapping."""
     if all(node.get(name) is None for name in (*table.PERSONS, *table.IMAGES)):
         return 0
-    layout = next((one for one in table.LAYOUTS if all(node.get(name) is not None for name in one.pose)), None)
+    layout = next((one for one in table.LAYOUTS if one.is_in(node)), None)
     if layout is None or layout.is_time_last:
         return 0
     try:
@@ -105,11 +100,8 @@ def _n_rows(content: Content, node: Mapping[Key, Any]) -> int:
     except ValueError:
         return 0
     n = shapes[0][0] if len(shapes[0]) > 1 else 0
-    is_table = all(
-        shape[:1] == (n,) and is_one_frame(shape[1:], counts)
-        for shape, counts in zip(shapes, layout.joints, strict=True)
-    )
-    return n if is_table else 0
+    each = zip(shapes, layout.joints, strict=True)
+    return n if all(shape[:1] == (n,) and is_one_frame(shape[1:], counts) for shape, counts in each) else 0
 
 
 def _words(content: Content, node: Mapping[Key, Any], names: Sequence[str], n: int) -> Sequence[Key]:

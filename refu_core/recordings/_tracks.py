@@ -34,12 +34,9 @@ def frames_of(content: Content) -> Mapping[Any, Any]:
 
     Raises `ValueError` for frames that don't fit each other.
     """
-
-    def is_body(node: Mapping[Key, Any]) -> bool:
-        return _layout_of(content, node) is not None
-
     content = _rows_apart(content)
-    found = [frames for frames in _sequences(content.root, is_body) if len(frames) > 1]
+    sequences = _sequences(content.root, lambda node: _layout_of(content, node) is not None)
+    found = [frames for frames in sequences if len(frames) > 1]
     tracks: dict[str, Any] = {}
     for k, frames in enumerate(found):
         people = _people(content, frames)
@@ -50,8 +47,7 @@ def frames_of(content: Content) -> Mapping[Any, Any]:
 
 def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str, Any]:
     if len(frames) > MAX_FRAMES:
-        msg = f"{len(frames)} frames, at most {MAX_FRAMES} are read; cut the clip"
-        raise ValueError(msg)
+        raise ValueError(f"{len(frames)} frames, at most {MAX_FRAMES} are read; cut the clip")
     layout = next(_layout_of(content, bodies[0]) for bodies in frames if bodies)
     assert layout is not None
     named = _who_is_who([(_name_of(body), _place_of(content, body, layout)) for body in bodies] for bodies in frames)
@@ -124,7 +120,7 @@ def _identified(content: Content, frame: Mapping[Key, Any]) -> list[dict[Key, An
 
 
 def _rows(content: Content, seen: Mapping[Key, Any]) -> Any:
-    layout = next((one for one in table.LAYOUTS if all(seen.get(name) is not None for name in one.pose)), None)
+    layout = next((one for one in table.LAYOUTS if one.is_in(seen)), None)
     if layout is None or _layout_of(content, seen) is not None:
         return seen
     n = len(content.array(seen[layout.pose[0]]))
@@ -143,7 +139,7 @@ def _rows(content: Content, seen: Mapping[Key, Any]) -> Any:
 def _layout_of(content: Content, node: Mapping[Key, Any]) -> table.Layout | None:
     """The layout of which a mapping holds one frame; None if there is none."""
     for layout in table.LAYOUTS:
-        if layout.is_time_last or not all(node.get(name) is not None for name in layout.pose):
+        if layout.is_time_last or not layout.is_in(node):
             continue
         try:
             shapes = [content.array(node[name]).shape for name in layout.pose]
@@ -171,8 +167,7 @@ def _stacked(content: Content, layout: table.Layout, seen: list[tuple[int, Mappi
             continue
         flat = [content.array(row).reshape(-1) for row in rows]
         if len({len(row) for row in flat}) > 1:
-            msg = f"{name} has {len(flat[0])} numbers in one frame and others in another"
-            raise ValueError(msg)
+            raise ValueError(f"{name} has {len(flat[0])} numbers in one frame and others in another")
         track[name] = np.stack(flat)
     return track
 

@@ -32,11 +32,9 @@ def transl_of(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: l
         notes.append(f"no translation ({names}): the person stays in one place")
         return np.zeros((n, 3))
     if array.dtype.kind not in "iuf":
-        msg = f"{names} must be numbers, got {array.dtype} {array.shape}"
-        raise ValueError(msg)
+        raise ValueError(f"{names} must be numbers, got {array.dtype} {array.shape}")
     if array.shape not in ((n, 3), (n, 1, 3), (1, n, 3)) and (n, *array.shape) != (1, 3):
-        msg = f"{names} must be ({n}, 3) like the pose, got {array.shape}"
-        raise ValueError(msg)
+        raise ValueError(f"{names} must be ({n}, 3) like the pose, got {array.shape}")
     return array.reshape(n, 3).astype(np.float64)
 
 
@@ -67,16 +65,14 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, has_age: b
     with np.errstate(over="ignore"):
         betas[: rows.shape[1]] = np.median(rows, axis=0) if len(rows) else 0.0
     if not np.isfinite(betas).all():
-        msg = "betas has values that are NaN or infinite, or too large for float32"
-        raise ValueError(msg)
+        raise ValueError("betas has values that are NaN or infinite, or too large for float32")
     return betas
 
 
 def fps_of(content: Content, value: Any) -> float:
     """Frames a second. Raises `ValueError` if there is no such number."""
     if value is None:
-        msg = "no frame rate in the file: say it, as in --fps 30 (in Python: fps=30)"
-        raise ValueError(msg)
+        raise ValueError("no frame rate in the file: say it, as in --fps 30 (in Python: fps=30)")
     if type(value) in (int, float):
         return float(value)
     array = np.asarray(value) if isinstance(value, str) else content.array(value)
@@ -85,8 +81,7 @@ def fps_of(content: Content, value: Any) -> float:
     if array.size == 1 and array.dtype.kind in "US":
         with contextlib.suppress(ValueError):
             return float(word_of(content, array))
-    msg = f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}"
-    raise ValueError(msg)
+    raise ValueError(f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}")
 
 
 def word_of(content: Content, value: Any, which: int = 0) -> str:

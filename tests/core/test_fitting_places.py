@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.fitting import Placing, SurfaceMesh, _fit, fit_garment, standing_pose
-from refu_core.fitting._clean import is_ball
+from refu_core.fitting._clean import no_opening
 from refu_core.fitting._pieces import without_floor
 from refu_core.fitting._place import Place, find_places
 from refu_core.fitting._surround import parts_legs
@@ -180,9 +180,9 @@ def test_what_is_said_is_not_overruled() -> None:
 
 def test_only_a_ball_has_no_opening() -> None:
     ball, ring = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.torus(1.0, 0.3)
-    assert is_ball(np.asarray(ball.faces, dtype=np.int64))
-    assert not is_ball(np.asarray(ball.faces[1:], dtype=np.int64))
-    assert not is_ball(np.asarray(ring.faces, dtype=np.int64))
+    assert no_opening(np.asarray(ball.faces, dtype=np.int64))
+    assert not no_opening(np.asarray(ball.faces[1:], dtype=np.int64))
+    assert not no_opening(np.asarray(ring.faces, dtype=np.int64))
 
 
 @pytest.mark.parametrize("taller", [1.0, 1.04])

@@ -16,8 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from msg_adapters.outputs._obstacles import Obstacles
-from msg_adapters.outputs._topics import Moment
+from msg_adapters.outputs._topics import Moment, Obstacles
 from refu_core import ExactSdf, GarmentPipeline, GarmentTemplate, MeshError, SmplFrame, load_garment
 from refu_core.garments import BUILTIN_GARMENTS
 from refu_core.outputs import (

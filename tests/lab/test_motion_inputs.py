@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import msg_adapters as adapters
 from msg_adapters.cdr import CdrWriter
-from msg_adapters.inputs._ros4hri import AXES
+from msg_adapters.inputs._joint_state import AXES
 from msg_adapters.markers import encode_lists
 from refu_core import SmplFrame
 from refu_core.keypoints import Proportions, Skeleton, keypoint_layout

@@ -40,7 +40,7 @@ from msg_adapters import (
     points_of,
 )
 from msg_adapters.cdr import CdrWriter
-from msg_adapters.inputs._ros4hri import AXES
+from msg_adapters.inputs._joint_state import AXES
 from msg_adapters.outputs import COLLISION_OBJECT, SCENE_UPDATE
 from msg_adapters.transforms import Transform, encode_transforms
 from refu_core import GarmentPipeline, SmplFrame, load_garment

@@ -23,7 +23,7 @@ import msg_adapters as adapters
 from msg_adapters import BagReader, BagWriter
 from msg_adapters.axes import SMPL_COLUMNS
 from refu_core import GarmentPipeline, RefuError, SmplFrame
-from refu_ros._bag_job import BagJob
+from refu_ros._beside import BagJob
 from refu_ros._node import GarmentNode
 from refu_ros._requests import _fill
 from refu_ros._settings import NodeSettings

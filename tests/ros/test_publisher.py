@@ -29,7 +29,7 @@ from rclpy.qos import QoSProfile  # noqa: E402
 from msg_adapters import load_motion  # noqa: E402
 from msg_adapters.motion import march  # noqa: E402
 from refu_ros._interfaces import interface  # noqa: E402
-from refu_ros._parameters import declare  # noqa: E402
+from refu_ros._settings import declare  # noqa: E402
 from refu_ros.smpl_publisher import PublisherOptions, SmplPublisher  # noqa: E402
 from tests.ros.ready import Forked, run_program  # noqa: E402
 

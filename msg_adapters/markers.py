@@ -1,5 +1,6 @@
-"""MarkerArray encoding: the message is laid out once, each frame writes its points into place.
+"""visualization_msgs/MarkerArray with one TRIANGLE_LIST or POINTS per garment, between arrays and CDR bytes.
 
+To encode, the message is laid out once, and each frame writes its points into place; to decode, nothing is copied.
 Building a message of 57,000 `Point` objects and serialising it takes hundreds of milliseconds; gathering the vertices
 of all triangle corners straight into the message's bytes takes a fraction of one.
 """
@@ -9,14 +10,16 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from msg_adapters.axes import SMPL_COLUMNS, WORLD_FRAME, InputAxes
-from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
-from msg_adapters.errors import EncodeError
+from msg_adapters.cdr import HEADER_BYTES, Buffer, CdrReader, CdrWriter, split_stamp
+from msg_adapters.errors import DecodeError, EncodeError
 
 Rgba = tuple[float, float, float, float]
 CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
@@ -28,11 +31,9 @@ def numbers(what: str, values: Any) -> NDArray[Any]:
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:
-        msg = f"{what}: wanted an array of numbers, got {type(values).__name__}: {error}"
-        raise EncodeError(msg) from None
+        raise EncodeError(f"{what}: wanted an array of numbers, got {type(values).__name__}: {error}") from None
     if array.dtype.kind not in "iuf":
-        msg = f"{what}: wanted an array of numbers, got {array.dtype} of shape {array.shape}"
-        raise EncodeError(msg)
+        raise EncodeError(f"{what}: wanted an array of numbers, got {array.dtype} of shape {array.shape}")
     return array
 
 
@@ -40,8 +41,7 @@ def finite_points(what: str, values: ArrayLike) -> NDArray[Any]:
     """Finite points as an array of shape (K, 3), K > 0. Raises `EncodeError` for anything else."""
     points = numbers(what, values)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
-        msg = f"{what}: wanted finite points of shape (K, 3), K > 0, got {points.shape}"
-        raise EncodeError(msg)
+        raise EncodeError(f"{what}: wanted finite points of shape (K, 3), K > 0, got {points.shape}")
     return points
 
 
@@ -52,8 +52,7 @@ def triangles(what: str, faces: ArrayLike, n_vertices: int) -> NDArray[np.intege
         msg = f"{what}: wanted faces of shape (F, 3) of integers, F > 0, got {array.shape} of {array.dtype}"
         raise EncodeError(msg)
     if array.min() < 0 or array.max() >= n_vertices:
-        msg = f"{what}: wanted face indices in [0, {n_vertices}), got {array.min()} ... {array.max()}"
-        raise EncodeError(msg)
+        raise EncodeError(f"{what}: wanted face indices in [0, {n_vertices}), got {array.min()} ... {array.max()}")
     return array
 
 
@@ -153,19 +152,14 @@ class MarkerArrayEncoder:
     ) -> None:
         names = [mesh.ns for mesh in meshes]
         if not names or len(set(names)) != len(names):
-            msg = f"wanted meshes with distinct namespaces, got {names}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted meshes with distinct namespaces, got {names}")
         if axes not in SMPL_COLUMNS:
-            msg = f"wanted axes {' or '.join(SMPL_COLUMNS)}, got {axes!r}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted axes {' or '.join(SMPL_COLUMNS)}, got {axes!r}")
         self._columns = SMPL_COLUMNS[axes]
         writer = CdrWriter()
         writer.fields("I", len(meshes))
-        options: dict[str, Any] = {"frame_id": frame_id, "lifetime_ns": lifetime_ns}
-        places = [
-            _write_marker(writer, ns=mesh.ns, color=mesh.color, points=np.zeros((mesh.faces.size, 3)), **options)
-            for mesh in meshes
-        ]
+        write = partial(_write_marker, writer, frame_id=frame_id, lifetime_ns=lifetime_ns)
+        places = [write(ns=one.ns, color=one.color, points=np.zeros((one.faces.size, 3))) for one in meshes]
         blank = writer.to_bytes()
         # float64 storage guarantees the alignment that the views below rely on.
         storage = np.zeros(-(-(_LEAD_BYTES + len(blank)) // 8), np.float64).view(np.uint8)
@@ -180,11 +174,7 @@ class MarkerArrayEncoder:
             self._slots.append(_Slot(mesh, corners, stamp_at, points, np.empty((mesh.n_vertices, 3))))
 
     def encode(
-        self,
-        vertices: Sequence[ArrayLike],
-        *,
-        stamp_ns: int | Sequence[int],
-        transl: ArrayLike | None = None,
+        self, vertices: Sequence[ArrayLike], *, stamp_ns: int | Sequence[int], transl: ArrayLike | None = None
     ) -> bytes:
         """One frame. Raises `EncodeError` for a wrong shape, a vertex that isn't finite, a stamp that fits no ROS time.
 
@@ -196,32 +186,25 @@ class MarkerArrayEncoder:
         """
         n = len(self._slots)
         if len(vertices) != n:
-            msg = f"wanted vertices of {n} meshes, got {len(vertices)}"
-            raise EncodeError(msg)
+            raise EncodeError(f"wanted vertices of {n} meshes, got {len(vertices)}")
         each = [stamp_ns] * n if isinstance(stamp_ns, (int, np.integer)) else stamp_ns
         stamps = [split_stamp(stamp) for stamp in each]
         if len(stamps) != n:
-            msg = f"wanted a stamp for all meshes or {n} stamps, got {len(stamps)}"
-            raise EncodeError(msg)
-        offsets = self._offsets(transl)
+            raise EncodeError(f"wanted a stamp for all meshes or {n} stamps, got {len(stamps)}")
+        offsets = np.zeros(3) if transl is None else numbers("transl", transl).astype(np.float64)
+        if offsets.shape not in ((3,), (n, 3)):
+            raise EncodeError(f"wanted a translation of shape (3,) or ({n}, 3), got {offsets.shape}")
+        offsets = np.broadcast_to(offsets, (n, 3))
         for i, slot in enumerate(self._slots):
             struct.pack_into("<iI", self._payload, slot.stamp_at, *stamps[i])
             self._write_points(slot, numbers(slot.mesh.ns, vertices[i]), offsets[i])
         return self._message.tobytes()
 
-    def _offsets(self, transl: ArrayLike | None) -> NDArray[np.float64]:
-        offsets = np.zeros(3) if transl is None else numbers("transl", transl).astype(np.float64)
-        if offsets.shape not in ((3,), (len(self._slots), 3)):
-            msg = f"wanted a translation of shape (3,) or ({len(self._slots)}, 3), got {offsets.shape}"
-            raise EncodeError(msg)
-        return np.broadcast_to(offsets, (len(self._slots), 3))
-
     def _write_points(self, slot: _Slot, vertices: NDArray[Any], offset: NDArray[np.float64]) -> None:
         mesh = slot.mesh
         if vertices.shape != (mesh.n_vertices, 3) or vertices.dtype not in (np.float32, np.float64):
-            msg = f"{mesh.ns}: wanted vertices ({mesh.n_vertices}, 3) of float32 or float64, "
-            msg += f"got {vertices.shape} of {vertices.dtype}"
-            raise EncodeError(msg)
+            wanted = f"wanted vertices ({mesh.n_vertices}, 3) of float32 or float64"
+            raise EncodeError(f"{mesh.ns}: {wanted}, got {vertices.shape} of {vertices.dtype}")
         with np.errstate(invalid="ignore", over="ignore"):
             for out, column in enumerate(self._columns):
                 np.add(vertices[:, column], offset[column], out=slot.placed[:, out], dtype=np.float64)
@@ -251,13 +234,13 @@ def encode_lists(
     """
     writer = CdrWriter()
     writer.fields("I", len(lists))
-    options: dict[str, Any] = {"frame_id": frame_id, "color": color, "kind": kind, "size": size}
-    options["lifetime_ns"] = lifetime_ns
+    write = partial(
+        _write_marker, writer, frame_id=frame_id, color=color, kind=kind, size=size, lifetime_ns=lifetime_ns
+    )
     for ns, stamp_ns, pose, points in lists:
         if not np.isfinite(pose).all():
-            msg = f"{ns}: wanted a finite pose, got {pose}"
-            raise EncodeError(msg)
-        _write_marker(writer, ns=ns, stamp_ns=stamp_ns, points=finite_points(ns, points), pose=pose, **options)
+            raise EncodeError(f"{ns}: wanted a finite pose, got {pose}")
+        write(ns=ns, stamp_ns=stamp_ns, points=finite_points(ns, points), pose=pose)
     return writer.to_bytes()
 
 
@@ -271,3 +254,90 @@ def encode_delete(names: Sequence[str], *, stamp_ns: int, frame_id: str = WORLD_
     for ns in names:
         _write_marker(writer, ns=ns, action=DELETE, frame_id=frame_id, stamp_ns=stamp_ns)
     return writer.to_bytes()
+
+
+_MIN_MARKER_BYTES = 180
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """The parts of visualization_msgs/Marker that triangle lists and points use."""
+
+    stamp_ns: int
+    frame_id: str
+    ns: str
+    id: int
+    type: int
+    action: int
+    pose: tuple[float, ...]
+    """Position xyz [m] and orientation xyzw."""
+    scale: tuple[float, ...]
+    color: tuple[float, ...]
+    """Red, green, blue, alpha."""
+    lifetime_ns: int
+    frame_locked: bool
+    points: NDArray[np.float64]
+    """Triangle corners [m], shape (3F, 3), or the points of POINTS, (V, 3), in the axes of `pose`: a read-only view of
+    the message."""
+    colors: NDArray[np.float32]
+    """Colour of each corner, shape (3F, 4), or (0, 4): a read-only view of the message."""
+
+    def placed(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points [m], shape (N, 3), from the axes of `pose` to those of `frame_id`."""
+        quaternion = np.array(self.pose[3:])
+        with np.errstate(all="ignore"):  # what isn't finite stays so
+            if quaternion[:3].any():  # a quaternion that nobody has set means no rotation
+                if not np.isfinite(quaternion).all():
+                    return np.full_like(points, np.nan)
+                quaternion /= np.abs(quaternion).max()  # its square is finite, and not zero
+                points = points @ Rotation.from_quat(quaternion).as_matrix().T
+            return points + self.pose[:3]
+
+
+def _marker(reader: CdrReader) -> Marker:
+    named = reader.fields("Tssiii")
+    pose, scale, color = reader.fields("ddddddd"), reader.fields("ddd"), reader.fields("ffff")
+    kept = reader.fields("T?")  # lifetime, frame_locked
+    points = reader.array("f8", 3 * reader.length(item_bytes=24)).reshape(-1, 3)
+    colors = reader.array("f4", 4 * reader.length(item_bytes=16)).reshape(-1, 4)
+    reader.fields("sTss")  # texture_resource, texture
+    reader.skip(reader.length(item_bytes=1))
+    reader.array("f4", 2 * reader.length(item_bytes=8))  # uv_coordinates
+    reader.fields("sss")  # text, mesh_resource, mesh_file
+    reader.skip(reader.length(item_bytes=1))
+    reader.fields("?")  # mesh_use_embedded_materials
+    return Marker(*named, pose, scale, color, *kept, points, colors)  # type: ignore[call-arg]
+
+
+def decode_marker_array(data: Buffer) -> list[Marker]:
+    """The markers of a `visualization_msgs/MarkerArray` in CDR; points and colours are views of `data`.
+
+    Raises `DecodeError` for anything that isn't one.
+    """
+    reader = CdrReader(data)
+    markers = [_marker(reader) for _ in range(reader.length(item_bytes=_MIN_MARKER_BYTES))]
+    reader.finish()
+    return markers
+
+
+def vertices_from_points(
+    points: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]], *, n_vertices: int | None = None
+) -> NDArray[np.float64]:
+    """Vertices, shape (V, 3), of a mesh whose triangle corners are `points`, shape (3F, 3), with known `faces`, (F, 3).
+
+    Raises `DecodeError` when the corners can't come from these faces, or a vertex is in none.
+    """
+    corners = np.asarray(faces).reshape(-1)
+    if points.shape != (corners.size, 3) or not corners.size:
+        msg = f"wanted the ({corners.size}, 3) corners of {corners.size // 3} triangles, got points {points.shape}"
+        raise DecodeError(msg)
+    count = int(corners.max()) + 1 if n_vertices is None else n_vertices
+    used = np.zeros(count, dtype=bool)
+    used[corners] = True
+    if not used.all():
+        raise DecodeError(f"vertex {int(np.argmin(used))} of {count} is in no triangle; its position can't be known")
+    vertices = np.empty((count, 3))
+    vertices[corners] = points
+    if not np.array_equal(vertices[corners], points):
+        raise DecodeError("the points' shared corners differ: they were made with other faces")
+    return vertices
