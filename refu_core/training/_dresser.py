@@ -33,9 +33,9 @@ class Dresser(nn.Module):
         refu: Refu | None,
         garment: GarmentTemplate,
         body: SmplBody,
-        *,
         in_refu: Sdf,
         in_loss: Sdf,
+        *,
         is_blended: bool = True,
     ) -> None:
         """For one garment on its body, both on one device; without `refu` the garment stays as predicted.

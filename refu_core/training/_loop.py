@@ -15,8 +15,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from refu_core.errors import RefuError
-from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
-from refu_core.training._progress import TrainingLog
+from refu_core.training._record import TrainingLog, load_checkpoint, save_checkpoint
 
 
 @dataclass(frozen=True)
@@ -69,27 +68,15 @@ class Loop:
     """Runs stages one after another; if interrupted, it goes on from the last checkpoint to the same weights."""
 
     def __init__(
-        self,
-        model: nn.Module,
-        settings: LoopSettings,
-        *,
-        folder: Path,
-        name: str,
-        identity: Any,
-        device: torch.device,
-        quiet: bool,
+        self, model: nn.Module, settings: LoopSettings, stem: Path, identity: Any, device: torch.device, *, quiet: bool
     ) -> None:
-        """Keeps a checkpoint and loss curves, `folder`/`name` with suffixes of their own.
+        """Keeps a checkpoint and loss curves, `stem` with suffixes of their own.
 
-        `identity` says what is trained how and on what: a checkpoint of anything else is refused.
-
-        Raises:
-            RefuError: the checkpoint there is of another training.
-            WeightsError: it is damaged.
+        `identity` says what is trained how and on what. Raises as `load_checkpoint` does.
         """
-        self.checkpoint = folder / f"{name}.checkpoint"
+        self.checkpoint = stem.with_name(f"{stem.name}.checkpoint")
         self._model, self._settings, self._device = model, settings, device
-        self._log = TrainingLog(folder, name=name, quiet=quiet, is_writer=is_writer())
+        self._log = TrainingLog(stem.parent, name=stem.name, quiet=quiet, is_writer=is_writer())
         self._identity = json.dumps(identity, sort_keys=True, default=str)
         self._done: list[str] = []
         self._resumed: dict[str, Any] | None = None

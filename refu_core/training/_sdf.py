@@ -17,10 +17,9 @@ from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
-from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
 from refu_core.training._data import check_set, drawn_pairs
 from refu_core.training._loop import cosine, is_writer, ranks, start_parallel
-from refu_core.training._progress import TrainingLog
+from refu_core.training._record import TrainingLog, load_checkpoint, save_checkpoint
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
 """λ_a, λ_b and λ_c of the paper's loss."""

@@ -140,7 +140,7 @@ def test_samples_are_unposed_displacements(
     dataset: Path, samples: TrainingSamples, garment: GarmentTemplate, body: SmplBody
 ) -> None:
     assert len(samples) == 200
-    whole = TakenAlong(body, garment).with_it(samples.displacement, samples.betas, samples.pose, samples.style)
+    whole = TakenAlong(body, garment).added(1, samples.displacement, samples.betas, samples.pose, samples.style)
     torch.testing.assert_close(whole, cloth(garment, samples.pose), atol=2e-4, rtol=0)
     assert (samples.displacement - whole).abs().max() > 0.01, "in some of these poses skin gives way"
     wrong = torch.zeros_like(samples.displacement)
