@@ -1,7 +1,7 @@
 """Networks that predict a garment's displacement in the unposed space; `skinned` is the one without a network."""
 
-from refu_core.backbones._controls import Controls as Controls
 from refu_core.backbones._decoder import BasisDecoder as BasisDecoder
+from refu_core.backbones._decoder import Controls as Controls
 from refu_core.backbones._decoder import DenseDecoder as DenseDecoder
 from refu_core.backbones._dynamics import Dynamic as Dynamic
 from refu_core.backbones._dynamics import Dynamics as Dynamics

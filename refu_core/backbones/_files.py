@@ -159,11 +159,7 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
 
 
 def load_backbone(
-    name: str,
-    garment: str | GarmentTemplate,
-    *,
-    mode: str = "none",
-    folder: Path | None = None,
+    name: str, garment: str | GarmentTemplate, *, mode: str = "none", folder: Path | None = None
 ) -> Backbone:
     """The trained backbone `name` of a garment.
 

@@ -48,11 +48,7 @@ def uses_basis(config: BackboneConfig, preset: str) -> bool:
 
 
 def build_backbone(
-    config: BackboneConfig,
-    garment: GarmentTemplate,
-    *,
-    basis: BasisDecoder | None = None,
-    pivots: Tensor | None = None,
+    config: BackboneConfig, garment: GarmentTemplate, *, basis: BasisDecoder | None = None, pivots: Tensor | None = None
 ) -> Network:
     """An untrained backbone for a garment.
 

@@ -13,8 +13,14 @@ from refu_core._warp import as_warp, ints
 from refu_core.body import blend_transforms
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import SmplFrame
-from refu_core.observation._cloth import Measured, ObservedCloth, averaged, within
-from refu_core.observation._settings import DEFAULT_OBSERVATION, ObservationSettings
+from refu_core.observation._cloth import (
+    DEFAULT_OBSERVATION,
+    Measured,
+    ObservationSettings,
+    ObservedCloth,
+    averaged,
+    within,
+)
 
 if TYPE_CHECKING:
     from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn

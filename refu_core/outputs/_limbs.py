@@ -125,9 +125,5 @@ def _contact(pair: int, rows: NDArray[np.float64]) -> LimbContact:
     share = area / max(float(area.sum()), 1e-12)
     first, second = divmod(pair, len(_PARTS))
     return LimbContact(
-        (_PARTS[first], _PARTS[second]),
-        float(area.sum()),
-        float(depth.max()),
-        float(share @ depth),
-        share @ places,
+        (_PARTS[first], _PARTS[second]), float(area.sum()), float(depth.max()), float(share @ depth), share @ places
     )

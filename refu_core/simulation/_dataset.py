@@ -12,11 +12,20 @@ from numpy.typing import NDArray
 from refu_core.errors import SimulationError
 from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
 from refu_core.simulation._joined import slices_of
-from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST
-from refu_core.simulation._postures import POSTURES
-from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, FORMAT, QUANTUM, SEQUENCES, Rows, dequantise, read_card, read_unseen
+from refu_core.simulation._poses import POSTURES
+from refu_core.simulation._store import (
+    CAUSES,
+    DONE,
+    FORMAT,
+    FPS,
+    QUANTUM,
+    SEQUENCES,
+    Rows,
+    dequantise,
+    read_card,
+    read_unseen,
+)
 
 
 @dataclass(frozen=True, eq=False)

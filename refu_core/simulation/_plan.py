@@ -18,8 +18,7 @@ from scipy.special import ndtr, ndtri
 from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
-from refu_core.simulation._poses import Clip, clip_pose, random_pose
-from refu_core.simulation._postures import drawn_posture
+from refu_core.simulation._poses import Clip, clip_pose, drawn_posture, random_pose
 
 TRAIN, TEST = 0, 1
 MAX_PIVOTS_SHARE = 0.5

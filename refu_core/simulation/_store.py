@@ -22,12 +22,15 @@ from numpy.typing import NDArray
 from refu_core._files import exclusive, open_file, read_json, replacing
 from refu_core._npz import DAMAGE, check_npy
 from refu_core.errors import SimulationError
-from refu_core.simulation._selection import CAUSES
 
 FORMAT = "refu-garments-2"
 SEQUENCES = "refu-sequences-2"
 QUANTUM = 2.0**-14
 """Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm per axis."""
+CAUSES = ("body_collision", "self_intersection", "stretch", "unsettled")
+"""Why a sample isn't taken, in the order of the checks."""
+FPS = 30
+"""Frames of a sequence [1/s]."""
 TO_DO, DONE, GIVEN_UP = 0, 1, 2
 _ROWS = "shard-0-of-1"
 _MAX_BYTES = 1 << 40
