@@ -18,6 +18,7 @@ from torch.nn import functional
 from refu_core._warp import Repeated, is_plain
 from refu_core.backbones._decode_kernels import WIDTH, Steps, Strip, decode_kernel
 from refu_core.errors import WeightsError
+from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
 
@@ -113,7 +114,7 @@ class DenseDecoder(nn.Module):
 
     def directions(self, garment: GarmentTemplate) -> Tensor:
         """How a unit of each of (β, γ) changes the template, as codes [m], shape (14, 3 V)."""
-        return _template_directions(garment)
+        return _directions(garment)
 
 
 class BasisDecoder(nn.Module):
@@ -163,8 +164,7 @@ class BasisDecoder(nn.Module):
 
         Raises `WeightsError` where something is missing, or parts don't fit each other or the garment.
         """
-        missing = [name for name in ("mean", "components") if name not in tensors]
-        if missing:
+        if missing := [name for name in ("mean", "components") if name not in tensors]:
             msg = f"has no {' and no '.join(missing)}: not an output basis"
             raise WeightsError(msg)
         coarse = tensors["components"].float()
@@ -194,7 +194,7 @@ class BasisDecoder(nn.Module):
 
         The first R columns are in the basis, the others in an orthonormal basis of what lies outside of it.
         """
-        whole = _template_directions(garment)
+        whole = _directions(garment)
         inside = whole @ self.components.T
         outside = torch.linalg.qr((whole - inside @ self.components).T).R.T
         return torch.cat((inside, outside), 1)
@@ -281,8 +281,6 @@ def _in_strips(rows: Tensor) -> Tensor:
 Decoder = DenseDecoder | BasisDecoder
 
 
-def _template_directions(garment: GarmentTemplate) -> Tensor:
-    styledirs = garment.styledirs
-    if styledirs is None:
-        styledirs = garment.shapedirs.new_zeros(len(garment.shapedirs), 4)
-    return torch.cat((garment.shapedirs, styledirs), 1).T.contiguous()
+def _directions(garment: GarmentTemplate) -> Tensor:
+    shape, style = garment.shapedirs, garment.styledirs
+    return torch.cat((shape, shape.new_zeros(len(shape), N_STYLES) if style is None else style), 1).T.contiguous()

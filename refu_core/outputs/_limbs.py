@@ -89,11 +89,8 @@ class LimbContacts:
         for mesh in self._meshes:
             mesh.refit()
         wp.launch(kernels.box_kernel, len(_PARTS), [self._parts], device="cpu")
-        found: list[tuple[NDArray[np.int32], NDArray[np.float64]]] = []
-        for name, garment in output.items():
-            found.append(self._pressed(garment.local, self._faces[name]))
-        pairs = np.concatenate([pair for pair, _ in found])
-        rows = np.concatenate([row for _, row in found])
+        found = [self._pressed(garment.local, self._faces[name]) for name, garment in output.items()]
+        pairs, rows = map(np.concatenate, zip(*found, strict=True))
         contacts = [_contact(int(pair), rows[pairs == pair]) for pair in np.unique(pairs)]
         return tuple(sorted(contacts, key=lambda contact: -contact.area))
 
@@ -103,16 +100,9 @@ class LimbContacts:
         """For the vertices that are pressed: the pair of parts, (M,), and area, depth and place, (M, 5)."""
         n = len(points)
         pair, depth = np.empty(n, np.int32), np.empty(n, np.float32)
-        wp.launch(
-            kernels.pressed_kernel,
-            n,
-            [wp.array(points, dtype=wp.vec3, device="cpu", copy=False), self._parts, PRESSED, _OPPOSED],
-            [
-                wp.array(pair, dtype=wp.int32, device="cpu", copy=False),
-                wp.array(depth, dtype=wp.float32, device="cpu", copy=False),
-            ],
-            device="cpu",
-        )
+        kinds = ((points, wp.vec3), (pair, wp.int32), (depth, wp.float32))
+        asked, *outputs = (wp.array(one, dtype=kind, device="cpu", copy=False) for one, kind in kinds)
+        wp.launch(kernels.pressed_kernel, n, [asked, self._parts, PRESSED, _OPPOSED], outputs, device="cpu")
         rows = np.flatnonzero(pair >= 0)
         if not len(rows):
             return pair[rows], np.empty((0, 5))

@@ -187,10 +187,8 @@ class PlannerMesh:
         a garment can't be made that coarse.
         """
         if max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
-            msg = (
-                f"wanted {_LEAST_TRIANGLES} triangles or more and a positive half thickness, got {max_triangles} "
-                f"and {half_thickness}"
-            )
+            wanted = f"{_LEAST_TRIANGLES} triangles or more and a positive half thickness"
+            msg = f"wanted {wanted}, got {max_triangles} and {half_thickness}"
             raise MeshError(msg)
         self.half_thickness = float(half_thickness)
         """[m]"""
@@ -241,10 +239,7 @@ class PlannerMesh:
         middle = self.middle(vertices)
         a, b, c = middle[self.sheet].transpose(1, 0, 2)
         u, v = b - a, c - a
-        normal = np.empty_like(u)
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            normal[:, i] = u[:, j] * v[:, k] - u[:, k] * v[:, j]
-        out = self._around @ normal
+        out = self._around @ np.cross(u, v)
         out *= self.half_thickness / np.maximum(np.sqrt(np.einsum("ij,ij->i", out, out)), 1e-12)[:, None]
         return np.concatenate((middle + out, middle - out))
 

@@ -37,7 +37,6 @@ REGIONS = 3
 """Number of pose regions: equal shares of the samples, from hardly bent to most bent."""
 _SWEEPS = 10
 """How often errors are averaged with those of neighbours: some fifty samples say too little about a single vertex."""
-_FILE = "sigma"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +80,7 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     (N, 24, 3). In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` σ.
     Raises `MeshError` for arrays of other shapes, and for fewer than 10 samples a region.
     """
-    length = np.asarray(errors, np.float64)
-    where = np.asarray(poses, np.float64)
+    length, where = np.asarray(errors, np.float64), np.asarray(poses, np.float64)
     n = len(length)
     if length.shape != (n, garment.n_vertices) or where.shape != (n, N_JOINTS, 3) or not np.isfinite(length).all():
         wanted = f"finite errors (N, {garment.n_vertices}) and poses (N, {N_JOINTS}, 3)"
@@ -98,10 +96,9 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
         variance = 0.5 * variance + 0.5 * (around @ variance) / degree
     sigma = np.sqrt(variance)
     bend = bend_of(garment, where)
-    middle, factor = [], []
-    for rows in np.array_split(np.argsort(bend, kind="stable"), REGIONS):
-        middle.append(np.median(bend[rows]))
-        factor.append(np.quantile(length[rows] / sigma, 0.9) / RADIUS_90)
+    regions = np.array_split(np.argsort(bend, kind="stable"), REGIONS)
+    middle = [np.median(bend[rows]) for rows in regions]
+    factor = [np.quantile(length[rows] / sigma, 0.9) / RADIUS_90 for rows in regions]
     return SigmaMap(sigma.astype(np.float32), np.array(middle, np.float32), np.array(factor, np.float32))
 
 
@@ -112,13 +109,10 @@ def save_sigma(
 
     Raises `WeightsError` where it can't be written.
     """
-    tensors = {
-        "sigma": torch.from_numpy(found.sigma).half(),
-        "bend": torch.from_numpy(found.bend),
-        "factor": torch.from_numpy(found.factor),
-    }
+    tensors = {name: torch.from_numpy(getattr(found, name)) for name in ("sigma", "bend", "factor")}
+    tensors["sigma"] = tensors["sigma"].half()
     about = {"garment": garment.name, "n_vertices": garment.n_vertices, **card}
-    return save_weights(weights_folder(garment.name, folder) / _FILE, tensors, about)
+    return save_weights(weights_folder(garment.name, folder) / "sigma", tensors, about)
 
 
 def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | None = None) -> SigmaMap:
@@ -126,7 +120,7 @@ def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | Non
 
     Raises `WeightsError` for a file that is damaged, or of another garment.
     """
-    stem = weights_folder(garment.name, folder) / _FILE
+    stem = weights_folder(garment.name, folder) / "sigma"
     if not stem.with_suffix(".json").exists():
         return SigmaMap.unknown(garment.n_vertices)
     stored = load_weights(stem, expect={"garment": garment.name, "n_vertices": garment.n_vertices})
@@ -150,8 +144,7 @@ class Sigma:
 
         Raises `WeightsError` for a damaged file of σ.
         """
-        self._body = pipeline.body
-        self._garments = pipeline.garments
+        self._body, self._garments = pipeline.body, pipeline.garments
         self.maps: dict[str, SigmaMap] = {}
         """By garment. One that no network drapes, or whose network wasn't measured, has `UNKNOWN_SIGMA`."""
         for name, garment in self._garments.items():

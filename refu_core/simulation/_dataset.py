@@ -101,10 +101,7 @@ class GarmentSequence:
 
 
 class _Finished:
-    """The finished rows of a set, in the order of their slots, memory-mapped and read-only.
-
-    A set that is still being written can be read: it has the rows that were finished when it was opened.
-    """
+    """The finished rows of a set, in the order of their slots, memory-mapped and read-only."""
 
     def __init__(self, path: str | Path, kind: str, *, first_clip: int) -> None:
         self._path = Path(path)
@@ -117,9 +114,8 @@ class _Finished:
         self._clips = self._clip_names()
         self._check("split", 0, 2)
         self.test: NDArray[np.bool_] = self.column("split") == TEST
-        """Which rows are kept for the test, shape (M,)."""
         self.train: NDArray[np.bool_] = ~self.test
-        """Which rows are for training, shape (M,)."""
+        """Which rows are for training, shape (M,); the others, `test`, are kept for the test."""
         self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])))
         if self.card.get("quantum_m") != QUANTUM:
             msg = f"{path}: wanted positions in units of {QUANTUM} m, got {str(self.card.get('quantum_m'))[:80]}"
@@ -216,11 +212,10 @@ class GarmentDataset(_Finished):
         """
         row, split = self._row(index)
         clip, frame = int(row["clip"]), int(row["frame"])
+        copied: dict[str, Any] = {name: np.array(row[name]) for name in ("pose", "betas", "style")}
         return GarmentSample(
             vertices=dequantise(row["vertices"]),
-            pose=np.array(row["pose"]),
-            betas=np.array(row["betas"]),
-            style=np.array(row["style"]),
+            **copied,
             slot=int(row["slot"]),
             pair=int(row["pair"]),
             split=split,
@@ -245,13 +240,11 @@ class GarmentSequences(_Finished):
         Raises `SimulationError` when there is no such sequence.
         """
         row, split = self._row(index)
+        copied: dict[str, Any] = {name: np.array(row[name]) for name in ("pose", "transl", "betas", "style")}
         return GarmentSequence(
             kept=np.asarray(row["cause"] == 0),
             cause=[None if cause == 0 else CAUSES[cause - 1] for cause in row["cause"]],
-            pose=np.array(row["pose"]),
-            transl=np.array(row["transl"]),
-            betas=np.array(row["betas"]),
-            style=np.array(row["style"]),
+            **copied,
             fps=float(FPS),
             number=int(row["slot"]),
             shape=int(row["shape"]),

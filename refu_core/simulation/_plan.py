@@ -21,7 +21,6 @@ from refu_core.garments import N_STYLES, garment_name
 from refu_core.simulation._poses import Clip, clip_pose, drawn_posture, random_pose
 
 TRAIN, TEST = 0, 1
-MAX_PIVOTS_SHARE = 0.5
 _MOST = 10**9
 
 
@@ -79,7 +78,7 @@ class SamplePlan:
             wanted = f"names of garments, whole numbers from 0 to {_MOST}, and shares"
             msg = f"a plan is made of {wanted}, got {str(asdict(self))[:400]}"
             raise SimulationError(msg)
-        if self.count < 1 or self.pivots < 1 or self.poses_per_pair < 1 or self.block < 1:
+        if min(self.count, self.pivots, self.poses_per_pair, self.block) < 1:
             msg = f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}"
             raise SimulationError(msg)
         of_poses = self.recorded_share, self.posture_share
@@ -96,7 +95,7 @@ class SamplePlan:
     @property
     def n_pivot(self) -> int:
         """Training samples of the pivots: the first ones of the set."""
-        return int((self.count - self.n_test) * MAX_PIVOTS_SHARE)
+        return (self.count - self.n_test) // 2
 
     def pair_of(self, slot: int) -> int:
         """Number of the style-shape pair of a slot; the pivots are 0 to `pivots` - 1."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._engine import Engine, InProcess, Lost
+from refu_core._files import replacing
 from refu_core._versions import versions
 from refu_core.errors import SimulationError
 from refu_core.frames import N_JOINTS
@@ -34,7 +35,6 @@ from refu_core.simulation._store import (
     locked,
     read_card,
     write_card,
-    write_unseen,
 )
 from refu_core.simulation._worker import SimulationSettings, Simulator, SlotSimulator
 
@@ -71,7 +71,8 @@ def summarise(output: str | Path) -> dict[str, Any]:
     else:
         kept = done
         simulated = int(kept.sum() + dropped.sum())
-        write_unseen(output, _unseen(column, card["plan"]["count"]))
+        with replacing(output / "unseen.npy") as file:
+            np.save(file, _unseen(column, card["plan"]["count"]))
         if done.any():
             figures["seconds_a_sample"] = seconds / int(done.sum())
     if kept.any():

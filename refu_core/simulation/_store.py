@@ -152,8 +152,7 @@ class Rows:
 
     def write(self, row: int, values: dict[str, Any]) -> None:
         """Fills a row; `state` last."""
-        names = [name for name in values if name != "state"]
-        for name in (*names, "state"):
+        for name in sorted(values, key=lambda name: name == "state"):
             self.arrays[name][row] = values[name]
             self.arrays[name].flush()
 
@@ -197,14 +196,11 @@ def write_card(directory: Path, card: dict[str, Any]) -> None:
         file.write((json.dumps(card, indent=1) + "\n").encode())
 
 
-def write_unseen(directory: Path, values: NDArray[np.float32]) -> None:
-    """Writes the distance of each slot's sample to the training set (count,), in one step."""
-    with replacing(directory / "unseen.npy") as file:
-        np.save(file, values)
-
-
 def read_unseen(directory: Path, count: int) -> NDArray[np.float32]:
-    """What `write_unseen` has written; NaN until it has. Raises `SimulationError` for a damaged file."""
+    """Distance of each slot's sample to the training set; NaN until `summarise` has written it.
+
+    Raises `SimulationError` for a damaged file.
+    """
     path = directory / "unseen.npy"
     if not path.exists():
         return np.broadcast_to(np.float32(np.nan), count)

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from torch import Tensor
 
-RECONSTRUCTION_WEIGHT = 1.5
-"""λ₁ of the paper (Sec. 4.2)."""
-COLLISION_WEIGHT = 0.5
-"""λ₂ of the paper."""
-
 
 def refu_loss(
     vertices: Tensor,
     truth: Tensor,
     distance: Tensor,
     *,
-    reconstruction_weight: float = RECONSTRUCTION_WEIGHT,
-    collision_weight: float = COLLISION_WEIGHT,
+    reconstruction_weight: float = 1.5,
+    collision_weight: float = 0.5,
 ) -> Tensor:
-    """L = λ₁ L_r + λ₂ L_c of garments after ReFU (paper, Eq. 7), shape ().
+    """L = λ₁ L_r + λ₂ L_c of garments after ReFU (paper, Eq. 7), with its weights λ₁ and λ₂ (Sec. 4.2), shape ().
 
     L_r is `reconstruction_loss`, L_c `collision_loss`. With positions in metres both are about 1e-4 for a good
     backbone, which is what the paper's weights balance. `vertices` and `truth` are garments [m], shape (B, N, 3),
-    `distance` the signed distance of `vertices` [m], (B, N); the weights are λ₁ and λ₂.
+    `distance` the signed distance of `vertices` [m], (B, N).
     """
     return reconstruction_weight * reconstruction_loss(vertices, truth) + collision_weight * collision_loss(distance)
 

@@ -97,10 +97,7 @@ class SdfSampler:
 
     def __init__(self, dataset: GarmentDataset, body: SmplBody, garment: GarmentTemplate, rows: Tensor) -> None:
         """For the samples `rows` of a set of `garment`."""
-        self.rows = rows
-        self._dataset = dataset
-        self._body = body
-        self._garment = garment
+        self.rows, self._dataset, self._body, self._garment = rows, dataset, body, garment
         self._part = dataset.parts[garment.name]
         self._exact = ExactSdf(body.faces, device=body.device)
 
@@ -113,20 +110,18 @@ class SdfSampler:
     def around(self, rows: Tensor, generator: torch.Generator, *, points: int, noise: float) -> SdfBatch:
         """`points` around the bodies of these samples."""
         samples = [self._dataset.sample(int(row)) for row in rows]
-        betas = torch.from_numpy(np.stack([sample.betas for sample in samples]))
-        pose = torch.from_numpy(np.stack([sample.pose for sample in samples]))
+        kinds = [(sample.betas, sample.pose, sample.vertices[self._part]) for sample in samples]
+        betas, pose, worn = (torch.from_numpy(np.stack(one)) for one in zip(*kinds, strict=True))
         rotation, root = body_frame(self._body, pose, betas)
-        worn = torch.from_numpy(np.stack([sample.vertices[self._part] for sample in samples]))
         worn = (worn - root[:, None]) @ rotation + root[:, None]
         pose = torch.cat((torch.zeros_like(pose[:, :1]), pose[:, 1:]), 1)
         skins = self._body(pose, betas).vertices
         counts = [int(share * points) for share in _SHARES]
         drawn, normals = [], []
         for skin, cloth in zip(skins, worn, strict=True):
-            on_skin, normal = _on_surface(skin, self._body.faces, counts[0], generator)
-            near_skin, _ = _on_surface(skin, self._body.faces, counts[1], generator)
-            on_cloth, _ = _on_surface(cloth, self._garment.faces, counts[2], generator)
-            near_cloth, _ = _on_surface(cloth, self._garment.faces, counts[3], generator)
+            surfaces = [(skin, self._body.faces)] * 2 + [(cloth, self._garment.faces)] * 2
+            places = [_on_surface(*surface, n, generator) for surface, n in zip(surfaces, counts, strict=True)]
+            (on_skin, normal), (near_skin, _), (on_cloth, _), (near_cloth, _) = places
             disturbed = torch.cat((near_skin, near_cloth))
             disturbed = disturbed + noise * torch.randn(disturbed.shape, generator=generator)
             anywhere = BOX * (torch.rand(points - sum(counts), 3, generator=generator) - 0.5)
@@ -163,12 +158,8 @@ def sdf_loss(distance: Tensor, gradient: Tensor, batch: SdfBatch) -> Tensor:
 def sdf_figures(network: SdfNetwork, batch: SdfBatch) -> dict[str, float]:
     """The supplement's figures of a network: mean absolute error [mm] of all points, mean relative error [%] of those
     that aren't on the surface; and the mean absolute error within 2 cm of the skin [mm]."""
-    found = torch.cat(
-        [
-            network(points[None], betas[None], pose[None])
-            for points, betas, pose in zip(batch.points, batch.betas, batch.pose, strict=True)
-        ]
-    )
+    bodies = zip(batch.points, batch.betas, batch.pose, strict=True)
+    found = torch.cat([network(points[None], betas[None], pose[None]) for points, betas, pose in bodies])
     off = batch.normals.shape[1]
     error, truth = (found - batch.distance).abs(), batch.distance.abs()
     return {
@@ -229,9 +220,8 @@ def train_sdf(
         torch.manual_seed(settings.seed)
         network = SdfNetwork(SDF_PRESETS[settings.preset]).to(where)
     optimiser = torch.optim.Adam(network.parameters(), lr=settings.learning_rate)
-    identity = json.dumps(
-        {**asdict(settings), "body": body.fingerprint, "garment": garment.name, "samples": len(splits["train"])}
-    )
+    about = {"garment": garment.name, "samples": len(splits["train"])}
+    identity = json.dumps({**asdict(settings), "body": body.fingerprint, **about})
     checkpoint = output / f"{name}.checkpoint"
     saved, step = load_checkpoint(checkpoint, identity), 0
     if saved is not None:
@@ -269,7 +259,7 @@ def train_sdf(
     card = {
         "kind": "sdf",
         "body_fingerprint": body.fingerprint,
-        "dataset": {"garment": garment.name, "samples": len(splits["train"])},
+        "dataset": about,
         "settings": asdict(settings),
         "figures": {part: sdf_figures(network, batch) for part, batch in checks.items()},
     }
