@@ -2,16 +2,12 @@
 
 from refu_core.backbones._decoder import BasisDecoder as BasisDecoder
 from refu_core.backbones._decoder import Controls as Controls
-from refu_core.backbones._decoder import DenseDecoder as DenseDecoder
 from refu_core.backbones._dynamics import Dynamic as Dynamic
 from refu_core.backbones._dynamics import Dynamics as Dynamics
 from refu_core.backbones._dynamics import DynamicsConfig as DynamicsConfig
 from refu_core.backbones._features import SEEN_TILT as SEEN_TILT
 from refu_core.backbones._features import PoseFeatures as PoseFeatures
 from refu_core.backbones._features import style_shape as style_shape
-from refu_core.backbones._features import tilt_rotvec as tilt_rotvec
-from refu_core.backbones._features import told_up as told_up
-from refu_core.backbones._features import up_in_root as up_in_root
 from refu_core.backbones._features import upright as upright
 from refu_core.backbones._files import backbone_from_weights as backbone_from_weights
 from refu_core.backbones._files import backbone_weights as backbone_weights
@@ -30,7 +26,6 @@ from refu_core.backbones._mlp import MlpConfig as MlpConfig
 from refu_core.backbones._perceptron import Perceptron as Perceptron
 from refu_core.backbones._perceptron import StackedPerceptrons as StackedPerceptrons
 from refu_core.backbones._presets import PRESETS as PRESETS
-from refu_core.backbones._presets import TRAINABLE as TRAINABLE
 from refu_core.backbones._presets import BackboneConfig as BackboneConfig
 from refu_core.backbones._presets import Network as Network
 from refu_core.backbones._presets import backbone_config as backbone_config
@@ -42,4 +37,3 @@ from refu_core.backbones._protocol import Skinned as Skinned
 from refu_core.backbones._protocol import WithoutWearerCode as WithoutWearerCode
 from refu_core.backbones._tailornet import TailorNet as TailorNet
 from refu_core.backbones._tailornet import TailorNetConfig as TailorNetConfig
-from refu_core.backbones._tailornet import kernel_weights as kernel_weights

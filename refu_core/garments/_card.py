@@ -26,10 +26,7 @@ class Tailoring:
 
 @dataclass(frozen=True)
 class GarmentCard:
-    """What is known of a garment besides its mesh.
-
-    Raises `ValueError` for values that no garment has.
-    """
+    """What is known of a garment besides its mesh. Raises `ValueError` for values that no garment has."""
 
     layer: int
     """A garment is worn over those with a lower number; within a layer, the one named later is the outer one."""

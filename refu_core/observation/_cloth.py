@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,13 +19,9 @@ from scipy.sparse.linalg import splu
 
 from refu_core._cache import keep, recall
 from refu_core._warp import as_warp, ints
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_normals
 from refu_core.observation._match_kernels import match_kernel
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from refu_core.garments import GarmentTemplate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 import warp as wp
@@ -21,9 +19,7 @@ from refu_core.observation._cloth import (
     averaged,
     within,
 )
-
-if TYPE_CHECKING:
-    from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn
+from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn
 
 _LONGEST_GAP = 10.0
 """A person who wasn't seen for this long is a new one [s]."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from refu_core.frames import SmplFrame
 from refu_core.outputs._clearance import Clearance
 from refu_core.outputs._limbs import LimbContact, LimbContacts
 from refu_core.outputs._normals import VertexNormals
@@ -16,14 +19,7 @@ from refu_core.outputs._openings import Opening, Openings
 from refu_core.outputs._planner import PlannerMesh
 from refu_core.outputs._sigma import Sigma
 from refu_core.outputs._visible import PinholeCamera, all_visible
-
-if TYPE_CHECKING:
-    import os
-
-    from numpy.typing import NDArray
-
-    from refu_core.frames import SmplFrame
-    from refu_core.realtime import GarmentPipeline, PipelineOutput
+from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 
 class Fittings:

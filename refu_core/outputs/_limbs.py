@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from refu_core._warp import as_warp, ints, memory
-from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
+from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody, part_of_faces
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
 from refu_core.outputs._worn import require_worn
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
-    from refu_core.realtime import GarmentPipeline, PipelineOutput
+from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 PRESSED = DEFAULT_GAP + 0.003
 """Cloth is pressed if its distances to the skins on both sides add up to less than this [m]: the room that the collider

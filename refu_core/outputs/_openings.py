@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.body import ARMS, LEGS, joints_of
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import as_points, rim_of
-
-if TYPE_CHECKING:
-    from refu_core.garments import GarmentTemplate
 
 NAMES = ("neck", "left_sleeve", "right_sleeve", "waist", "hem", "left_leg", "right_leg", "front")
 """What openings are called, in the order in which they are listed; others are `opening_0`, `opening_1`, …"""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +18,11 @@ from refu_core._cache import keep, recall
 from refu_core.body import Surface
 from refu_core.errors import MeshError
 from refu_core.frames import SmplFrame
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity, as_points, rim_of, vertex_areas
 from refu_core.outputs._simplify import simplify
+from refu_core.realtime import GarmentPipeline
 from refu_core.skeleton import posed
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from refu_core.garments import GarmentTemplate
-    from refu_core.realtime import GarmentPipeline
 
 Points = NDArray[np.float64]
 _LEAST_WEIGHT = 0.01

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,19 +15,14 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from refu_core.backbones import SEEN_TILT
+from refu_core.body import SmplBody
 from refu_core.errors import FrameError, MeshError, WeightsError
-from refu_core.frames import N_JOINTS
+from refu_core.frames import N_JOINTS, SmplFrame
+from refu_core.garments import GarmentTemplate
 from refu_core.outputs._worn import require_worn
+from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.skeleton import CARRIED
 from refu_core.weights import load_weights, save_weights, weights_folder
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from refu_core.body import SmplBody
-    from refu_core.frames import SmplFrame
-    from refu_core.garments import GarmentTemplate
-    from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 UNKNOWN_SIGMA = 0.03
 """σ of every vertex of a garment whose network has no `sigma` file, or that has no network and follows the skin [m].

@@ -7,10 +7,8 @@ from refu_core.simulation._dataset import GarmentSample as GarmentSample
 from refu_core.simulation._dataset import GarmentSequence as GarmentSequence
 from refu_core.simulation._dataset import GarmentSequences as GarmentSequences
 from refu_core.simulation._dataset import open_dataset as open_dataset
-from refu_core.simulation._drape import CANONICAL_POSE as CANONICAL_POSE
 from refu_core.simulation._drape import Draper as Draper
 from refu_core.simulation._drape import DrapeSettings as DrapeSettings
-from refu_core.simulation._drape import SettledDrape as SettledDrape
 from refu_core.simulation._drape import colliders as colliders
 from refu_core.simulation._plan import SamplePlan as SamplePlan
 from refu_core.simulation._plan import names_of as names_of
@@ -27,7 +25,6 @@ from refu_core.simulation._produce import summarise as summarise
 from refu_core.simulation._sequences import SequencePlan as SequencePlan
 from refu_core.simulation._sequences import SequenceSettings as SequenceSettings
 from refu_core.simulation._sequences import simulate_sequences as simulate_sequences
-from refu_core.simulation._store import CAUSES as CAUSES
 from refu_core.simulation._store import dequantise as dequantise
 from refu_core.simulation._worker import SelectionSettings as SelectionSettings
 from refu_core.simulation._worker import SimulationSettings as SimulationSettings

@@ -235,10 +235,7 @@ class GarmentSequences(_Finished):
         self._check("cause", 0, len(CAUSES) + 1)
 
     def sequence(self, index: int) -> GarmentSequence:
-        """The sequence of this index, -S to S - 1.
-
-        Raises `SimulationError` when there is no such sequence.
-        """
+        """The sequence of this index, -S to S - 1. Raises `SimulationError` when there is no such sequence."""
         row, split = self._row(index)
         copied: dict[str, Any] = {name: np.array(row[name]) for name in ("pose", "transl", "betas", "style")}
         return GarmentSequence(

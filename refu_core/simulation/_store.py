@@ -70,10 +70,7 @@ def columns_of(kind: str, shape: tuple[int, ...]) -> Columns:
 
 
 def quantise(vertices: NDArray[np.floating]) -> NDArray[np.int16]:
-    """Positions [m] within ±2 m in units of `QUANTUM`.
-
-    Raises `SimulationError` for positions that don't fit.
-    """
+    """Positions [m] within ±2 m in units of `QUANTUM`. Raises `SimulationError` for positions that don't fit."""
     units = np.rint(np.asarray(vertices, np.float64) / QUANTUM)
     if not np.abs(units).max(initial=0) < 2**15:
         msg = "a garment more than 2 m away from its body can't be stored: the simulation has failed"

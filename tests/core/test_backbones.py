@@ -17,10 +17,8 @@ from torch import Tensor
 
 from refu_core import WeightsError, load_garment
 from refu_core.backbones import (
-    TRAINABLE,
     BasisDecoder,
     Controls,
-    DenseDecoder,
     Gcnn,
     GcnnConfig,
     LaplacianSmoothing,
@@ -33,18 +31,18 @@ from refu_core.backbones import (
     backbone_config,
     backbone_from_weights,
     build_backbone,
-    kernel_weights,
     load_backbone,
     load_basis,
     save_backbone,
     save_basis,
     style_shape,
-    tilt_rotvec,
-    told_up,
-    up_in_root,
 )
+from refu_core.backbones._decoder import DenseDecoder
+from refu_core.backbones._features import tilt_rotvec, told_up, up_in_root
 from refu_core.backbones._gcnn import UpConv, sampled
 from refu_core.backbones._perceptron import StackedPerceptrons
+from refu_core.backbones._presets import TRAINABLE
+from refu_core.backbones._tailornet import kernel_weights
 from refu_core.body import rotvec_to_rotmat
 from refu_core.errors import RefuError
 from refu_core.garments import PAPER_GARMENTS, GarmentTemplate

@@ -32,7 +32,6 @@ from refu_core.errors import BodyError
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
-    CAUSES,
     POSTURES,
     Draper,
     GarmentDataset,
@@ -51,7 +50,7 @@ from refu_core.simulation import (
 )
 from refu_core.simulation._drape import CANONICAL_POSE, COMFORT_POSES
 from refu_core.simulation._plan import TEST, TRAIN
-from refu_core.simulation._store import DONE, FORMAT, QUANTUM, TO_DO, Rows, dequantise, locked, quantise
+from refu_core.simulation._store import CAUSES, DONE, FORMAT, QUANTUM, TO_DO, Rows, dequantise, locked, quantise
 from refu_core.simulation._worker import Selector
 from refu_lab.cli import main
 from refu_lab.contact_sheet import contact_sheet

@@ -38,8 +38,7 @@ from refu_core.simulation._plan import TEST
 from refu_core.simulation._sequences import STEPS, draw_motion, n_steps
 from refu_core.simulation._store import FPS, SEQUENCES, TO_DO, Rows
 from refu_core.simulation._worker import Selector
-from refu_core.training import read_samples
-from refu_core.training._data import TakenAlong
+from refu_core.training._data import TakenAlong, read_samples
 from refu_lab.cli import main
 
 GARMENT = "short-pant-male"
