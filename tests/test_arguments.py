@@ -339,7 +339,7 @@ def test_a_bug_is_one_line_and_shows_where_it_is_when_asked(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def collect() -> None:
-        raise KeyError("it\x1b[2J")  # noqa: EM101
+        raise KeyError("it\x1b[2J")
 
     monkeypatch.setattr("refu_lab.info.collect", collect)
     assert main(["info"]) == cli.EXIT_BUG

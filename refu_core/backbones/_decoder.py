@@ -136,8 +136,7 @@ class BasisDecoder(nn.Module):
         """
         super().__init__()
         if components.ndim != 2 or components.shape[1] != mean.numel():
-            msg = f"wanted a basis of (R, {mean.numel()}), got {tuple(components.shape)}: get them again"
-            raise WeightsError(msg)
+            raise WeightsError(f"wanted a basis of (R, {mean.numel()}), got {tuple(components.shape)}: get them again")
         self.controls = controls
         self._at_controls = None
         if controls is not None:
@@ -165,13 +164,11 @@ class BasisDecoder(nn.Module):
         Raises `WeightsError` where something is missing, or parts don't fit each other or the garment.
         """
         if missing := [name for name in ("mean", "components") if name not in tensors]:
-            msg = f"has no {' and no '.join(missing)}: not an output basis"
-            raise WeightsError(msg)
+            raise WeightsError(f"has no {' and no '.join(missing)}: not an output basis")
         coarse = tensors["components"].float()
         if "controls" in tensors:
             if garment is None:
-                msg = "is known at controls alone: say whose basis it is"
-                raise WeightsError(msg)
+                raise WeightsError("is known at controls alone: say whose basis it is")
             return cls(tensors["mean"].float(), coarse, controls=Controls.of(garment, tensors["controls"]))
         nothing = torch.zeros(0, *coarse.shape[1:], dtype=torch.int8)
         stored = _Stored(coarse, tensors.get("fine", nothing), tensors.get("steps", coarse.new_zeros(0)).float())

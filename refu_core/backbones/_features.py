@@ -81,8 +81,7 @@ class PoseFeatures(nn.Module):
     def __init__(self, joints: tuple[int, ...], encoding: str) -> None:
         super().__init__()
         if encoding not in ENCODINGS:
-            msg = f"no pose encoding {encoding!r}: wanted {' or '.join(ENCODINGS)}"
-            raise RefuError(msg)
+            raise RefuError(f"no pose encoding {encoding!r}: wanted {' or '.join(ENCODINGS)}")
         self.encoding = encoding
         self.joints = tuple(j for j in joints if j != 0)
         self.size = 3 + 9 * len(self.joints) if encoding == "matrix" else 72

@@ -54,8 +54,7 @@ def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, A
     try:
         basis = BasisDecoder.of_tensors(weights.tensors, garment)
     except WeightsError as error:
-        msg = f"{weights.path}: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{weights.path}: {error}") from error
     return basis, str(weights.card["sha256"])
 
 
@@ -100,15 +99,13 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
         identity = {key: card[key] for key in ("garment", "body_fingerprint") if key in card}
         basis, digest = load_basis(weights.path.parent, template, expect=identity)
         if digest != card["basis_sha256"]:
-            msg = f"{weights.path}: made for another basis than the one beside it; get both files again"
-            raise WeightsError(msg)
+            raise WeightsError(f"{weights.path}: made for another basis than the one beside it; get both files again")
     tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
     build = partial(build_backbone, config, template, basis=basis, pivots=tensors.get("pivots"))
     try:
         module = build_for(tensors, build, shared="decoder.")
     except WeightsError as error:
-        msg = f"{weights.path}: doesn't fit {garment.name}: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{weights.path}: doesn't fit {garment.name}: {error}") from error
     module = module.float().to(device).eval()
     with torch.no_grad():
         rest = memory(1, N_BETAS, device=device), memory(1, N_JOINTS, 3, device=device)
@@ -140,8 +137,7 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     if name != BackboneName.DYNAMIC and not (name == BackboneName.AUTO and there):
         return network
     if not isinstance(network, TailorNet):
-        msg = f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}"
-        raise WeightsError(msg)
+        raise WeightsError(f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}")
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
     stored = load_weights(weights.path.with_name("dynamics"), expect=expect)
     config = config_of_card(DynamicsConfig, stored.card.get("config"))
@@ -152,8 +148,7 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     try:
         dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
     except WeightsError as error:
-        msg = f"{stored.path}: doesn't fit {weights.path.name}: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{stored.path}: doesn't fit {weights.path.name}: {error}") from error
     dynamics = dynamics.float().to(next(network.parameters()).device)
     return Dynamic(network, dynamics).eval().requires_grad_(False)
 

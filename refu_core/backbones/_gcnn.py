@@ -44,8 +44,7 @@ class GcnnConfig:
         """Raises `WeightsError` for graphs that would take for ever to make."""
         if not 1 <= self.stride <= _MOST_STRIDE or not 1 <= len(self.channels) <= _MOST_LEVELS:
             wanted = f"strides to {_MOST_STRIDE}, {_MOST_LEVELS} channels at most"
-            msg = f"wanted {wanted}, got {self.stride}, {self.channels}"
-            raise WeightsError(msg)
+            raise WeightsError(f"wanted {wanted}, got {self.stride}, {self.channels}")
 
     @classmethod
     def paper(cls, joints: tuple[int, ...]) -> GcnnConfig:

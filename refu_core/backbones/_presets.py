@@ -33,11 +33,9 @@ Network = TailorNet | Mlp | Gcnn
 def backbone_config(name: str, garment: GarmentTemplate, *, preset: str = "realtime") -> BackboneConfig:
     """The configuration of the backbone `name` for a garment. Raises `WeightsError` for no such name or preset."""
     if name not in _CONFIGS:
-        msg = f"no backbone {name!r} that could be trained: wanted {', '.join(TRAINABLE)}"
-        raise WeightsError(msg)
+        raise WeightsError(f"no backbone {name!r} that could be trained: wanted {', '.join(TRAINABLE)}")
     if preset not in PRESETS:
-        msg = f"no preset {preset!r}: wanted {' or '.join(PRESETS)}"
-        raise WeightsError(msg)
+        raise WeightsError(f"no preset {preset!r}: wanted {' or '.join(PRESETS)}")
     config, joints = _CONFIGS[name], garment.card.joints
     return config.paper(joints) if preset == "paper" else config(joints)
 
@@ -61,8 +59,7 @@ def build_backbone(
     if isinstance(config, MlpConfig):
         return Mlp(config, decoder)
     if pivots is None:
-        msg = "a tailornet needs pivots: (β, γ) of the style-shape pairs of its high-frequency nets"
-        raise WeightsError(msg)
+        raise WeightsError("a tailornet needs pivots: (β, γ) of the style-shape pairs of its high-frequency nets")
     return TailorNet(config, garment, decoder, pivots)
 
 
@@ -74,6 +71,5 @@ def backbone_name(config: BackboneConfig) -> str:
 def config_from_card(name: str, values: Any) -> BackboneConfig:
     """The configuration that a card has as `values`. Raises `WeightsError` unless it fits the backbone `name`."""
     if name not in _CONFIGS:
-        msg = f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again"
-        raise WeightsError(msg)
+        raise WeightsError(f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again")
     return config_of_card(_CONFIGS[name], values)

@@ -62,8 +62,7 @@ class GarmentCard:
         }
         for name, (is_right, wanted) in checks.items():
             if not is_right:
-                msg = f"{name}: wanted {wanted}, got {str(getattr(self, name))[:80]}"
-                raise ValueError(msg)
+                raise ValueError(f"{name}: wanted {wanted}, got {str(getattr(self, name))[:80]}")
 
 
 def card_to_json(card: GarmentCard) -> str:
@@ -77,15 +76,13 @@ def json_to_card(text: bytes | str) -> GarmentCard:
     wanted = [field.name for field in fields(GarmentCard)]
     if not isinstance(values, dict) or sorted(values) != sorted(wanted):
         got = ", ".join(map(str, values))[:200] if isinstance(values, dict) else str(values)[:80]
-        msg = f"wanted a card of {', '.join(wanted)}, got {got}"
-        raise ValueError(msg)
+        raise ValueError(f"wanted a card of {', '.join(wanted)}, got {got}")
     try:
         tailoring = tuple(Tailoring(**one) for one in values["tailoring"])
         rows = {name: tuple(values[name]) for name in ("color", "joints")}
         return GarmentCard(**{**values, **rows, "tailoring": tailoring})
     except TypeError as error:
-        msg = f"a card of other types: {error}"
-        raise ValueError(msg) from error
+        raise ValueError(f"a card of other types: {error}") from error
 
 
 def _is_number(value: Any) -> bool:

@@ -103,8 +103,7 @@ class GarmentTemplate:
         offset = betas @ self.shapedirs.T
         if style is not None:
             if self.styledirs is None:
-                msg = f"{self.name} has one style only: leave the style out"
-                raise GarmentError(msg)
+                raise GarmentError(f"{self.name} has one style only: leave the style out")
             offset = offset + style @ self.styledirs.T
         return self.v_template + offset.view(len(offset), self.n_vertices, 3)
 

@@ -166,8 +166,7 @@ def _inverse(matrix: F64) -> F64:
     factor, _ = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
     found, failed = dpotri(factor, lower=True, overwrite_c=True)
     if failed:
-        msg = f"row {failed} of the factor is zero"
-        raise LinAlgError(msg)
+        raise LinAlgError(f"row {failed} of the factor is zero")
     half = np.tril(found)
     half += np.tril(half, -1).T
     return np.asarray(half)

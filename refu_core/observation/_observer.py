@@ -174,8 +174,7 @@ def _finite(name: str, value: ArrayLike, ndim: int) -> NDArray[np.float64]:
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        msg = f"{name} must be numbers of the shape {wanted}, got {type(value).__name__}"
-        raise FrameError(msg) from error
+        raise FrameError(f"{name} must be numbers of the shape {wanted}, got {type(value).__name__}") from error
     if array.ndim != ndim or array.shape[-1] != 3 or not np.isfinite(array).all():
         msg = f"{name} must be finite numbers of the shape {wanted}, got {array.shape}; leave out what isn't measured"
         raise FrameError(msg)

@@ -35,8 +35,7 @@ class VertexNormals:
         """
         columns = np.ascontiguousarray(np.asarray(vertices, np.float32).T)
         if columns.shape != (3, self._n_vertices):
-            msg = f"vertices must have the shape ({self._n_vertices}, 3), got {columns.shape[::-1]}"
-            raise MeshError(msg)
+            raise MeshError(f"vertices must have the shape ({self._n_vertices}, 3), got {columns.shape[::-1]}")
         for corner, points in zip(self._corners, self._points, strict=True):
             for column, out in zip(columns, points, strict=True):
                 np.take(column, corner, out=out, mode="clip")

@@ -185,8 +185,7 @@ class PlannerMesh:
         """
         if max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
             wanted = f"{_LEAST_TRIANGLES} triangles or more and a positive half thickness"
-            msg = f"wanted {wanted}, got {max_triangles} and {half_thickness}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted {wanted}, got {max_triangles} and {half_thickness}")
         self.half_thickness = float(half_thickness)
         """[m]"""
         rest = garment.v_template.detach().cpu().double().numpy()
@@ -218,8 +217,7 @@ class PlannerMesh:
         """
         template = pipeline.garments.get(garment)
         if template is None:
-            msg = f"the pipeline has no garment {garment!r}: wanted one of {', '.join(pipeline.garments)}"
-            raise MeshError(msg)
+            raise MeshError(f"the pipeline has no garment {garment!r}: wanted one of {', '.join(pipeline.garments)}")
         return cls(template, max_triangles, half_thickness=half_thickness, worn=lambda: _practised(pipeline, garment))
 
     def middle(self, vertices: Any) -> NDArray[np.float64]:

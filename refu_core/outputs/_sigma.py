@@ -80,11 +80,9 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     n = len(length)
     if length.shape != (n, garment.n_vertices) or where.shape != (n, N_JOINTS, 3) or not np.isfinite(length).all():
         wanted = f"finite errors (N, {garment.n_vertices}) and poses (N, {N_JOINTS}, 3)"
-        msg = f"wanted {wanted}, got {length.shape} and {where.shape}"
-        raise MeshError(msg)
+        raise MeshError(f"wanted {wanted}, got {length.shape} and {where.shape}")
     if n < 10 * REGIONS:
-        msg = f"σ needs {10 * REGIONS} samples or more, got {n}"
-        raise MeshError(msg)
+        raise MeshError(f"σ needs {10 * REGIONS} samples or more, got {n}")
     around = garment.mesh.adjacency_matrix()
     degree = np.maximum(around.sum(axis=1), 1.0)
     variance = (length**2).mean(0) / 3
@@ -123,12 +121,10 @@ def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | Non
     try:
         sigma, bend, factor = (stored.tensors[key].float().numpy() for key in ("sigma", "bend", "factor"))
     except KeyError as error:
-        msg = f"{stored.path}: wanted the tensors sigma, bend and factor, there is no {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{stored.path}: wanted the tensors sigma, bend and factor, there is no {error}") from error
     is_right = sigma.shape == (garment.n_vertices,) and bend.ndim == 1 and bend.shape == factor.shape and len(bend)
     if not is_right or not ((sigma > 0).all() and (factor > 0).all() and (np.diff(bend) >= 0).all()):
-        msg = f"{stored.path}: not the σ of {garment.name}: make it anew with scripts/fit_sigma.py"
-        raise WeightsError(msg)
+        raise WeightsError(f"{stored.path}: not the σ of {garment.name}: make it anew with scripts/fit_sigma.py")
     return SigmaMap(sigma, bend, factor)
 
 
@@ -207,11 +203,9 @@ def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.f
         array = np.full(0, np.nan)
     if array.shape not in shapes or not np.isfinite(array).all():
         wanted, got = " or ".join(map(str, shapes)), array.shape if array.size else type(value).__name__
-        msg = f"{name} must be finite numbers of the shape {wanted}, got {got}"
-        raise FrameError(msg)
+        raise FrameError(f"{name} must be finite numbers of the shape {wanted}, got {got}")
     if (np.diagonal(array, axis1=-2, axis2=-1) < 0).any():
-        msg = f"{name} has a negative variance on its diagonal"
-        raise FrameError(msg)
+        raise FrameError(f"{name} has a negative variance on its diagonal")
     if np.abs(array).max() > _LARGEST:
         msg = f"{name}: wanted numbers up to {_LARGEST:g}, got {np.abs(array).max():g}: leave out what isn't known"
         raise FrameError(msg)

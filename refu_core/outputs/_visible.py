@@ -77,8 +77,7 @@ class PinholeCamera:
         """
         target, eye = (checked_numbers(name, at, (3,), np.float64) for name, at in (("target", target), ("eye", eye)))
         if not 0 < fov < math.pi or not width > 0:
-            msg = f"wanted a positive width and an angle below 180 degrees, got {width} pixels and {fov} rad"
-            raise MeshError(msg)
+            raise MeshError(f"wanted a positive width and an angle below 180 degrees, got {width} pixels and {fov} rad")
         away = target - eye
         right = np.cross(away, [0.0, 1.0, 0.0])
         if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(away):

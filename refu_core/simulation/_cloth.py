@@ -37,8 +37,7 @@ class ClothTopology:
         opposite = mesh.faces[:, [2, 0, 1]].reshape(-1)
         count = mesh.n_faces_of_edge
         if count.max(initial=0) > 2:
-            msg = f"a garment's edges need one or two faces, got {count.max()} on one edge: clean the mesh"
-            raise MeshError(msg)
+            raise MeshError(f"a garment's edges need one or two faces, got {count.max()} on one edge: clean the mesh")
         by_edge = opposite[np.argsort(mesh.edge_of_corner.ravel(), kind="stable")]
         first = np.concatenate(([0], np.cumsum(count)))[:-1]
         inner = count == 2

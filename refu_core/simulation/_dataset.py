@@ -174,16 +174,14 @@ class _Finished:
         Raises `SimulationError` for a name that is no column.
         """
         if name not in self._columns:
-            msg = f"wanted one of the columns {', '.join(sorted(self._columns))}, got {name!r}"
-            raise SimulationError(msg)
+            raise SimulationError(f"wanted one of the columns {', '.join(sorted(self._columns))}, got {name!r}")
         found: NDArray[Any] = self._columns[name][self._rows]
         return found
 
     def _row(self, index: int) -> tuple[dict[str, Any], str]:
         """The columns of one row, and its split. Raises `SimulationError` when there is no such row."""
         if not -len(self) <= index < len(self):
-            msg = f"the set has {len(self)} finished rows, there is none of the index {index}"
-            raise SimulationError(msg)
+            raise SimulationError(f"the set has {len(self)} finished rows, there is none of the index {index}")
         row = {name: values[self._rows[index]] for name, values in self._columns.items()}
         return row, "test" if row["split"] == TEST else "train"
 

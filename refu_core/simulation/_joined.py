@@ -43,8 +43,7 @@ class JoinedGarments:
         by_name = {garment.name: garment for garment in garments}
         if not garments or len(by_name) < len(garments) or len({garment.body for garment in garments}) > 1:
             named = ", ".join(f"{garment.name} for {garment.body}" for garment in garments) or "none"
-            msg = f"wanted different garments of one body, got {named}"
-            raise SimulationError(msg)
+            raise SimulationError(f"wanted different garments of one body, got {named}")
         self.garments = tuple(by_name[name] for name in inner_first(by_name))
         """From the skin outwards."""
         self.parts = slices_of({garment.name: garment.n_vertices for garment in self.garments})

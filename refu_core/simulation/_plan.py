@@ -76,16 +76,13 @@ class SamplePlan:
         is_whole = all(isinstance(number, int) and 0 <= number <= _MOST for number in whole)
         if not (is_named and is_whole and all(isinstance(share, Real) for share in shares)):
             wanted = f"names of garments, whole numbers from 0 to {_MOST}, and shares"
-            msg = f"a plan is made of {wanted}, got {str(asdict(self))[:400]}"
-            raise SimulationError(msg)
+            raise SimulationError(f"a plan is made of {wanted}, got {str(asdict(self))[:400]}")
         if min(self.count, self.pivots, self.poses_per_pair, self.block) < 1:
-            msg = f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}"
-            raise SimulationError(msg)
+            raise SimulationError(f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}")
         of_poses = self.recorded_share, self.posture_share
         if not (0 <= self.test_share < 1 and min(of_poses) >= 0 and sum(of_poses) <= 1 and self.spread > 0):
             wanted = "shares must lie in [0, 1), those of poses sum up to 1 at most, and the spread be above 0"
-            msg = f"{wanted}, got {asdict(self)}"
-            raise SimulationError(msg)
+            raise SimulationError(f"{wanted}, got {asdict(self)}")
 
     @property
     def n_test(self) -> int:

@@ -57,8 +57,7 @@ class Clip:
         try:
             wanted = np.minimum(np.arange(n_resampled(n, self.fps, fps)) * (self.fps / fps), n - 1)
         except ValueError as error:
-            msg = f"{self.name}: {error}"
-            raise SimulationError(msg) from error
+            raise SimulationError(f"{self.name}: {error}") from error
         poses, transl = interpolated(self.poses, self.transl, np.arange(n), wanted)
         return Clip(self.name, poses.astype(np.float32), transl, fps, self.notes)
 
@@ -85,8 +84,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     for file in files:
         found = read_recording(file, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
         if not (np.isfinite(found.poses).all() and np.isfinite(found.transl).all()):
-            msg = f"{file}: wanted finite poses and trans; cut out the frames that aren't"
-            raise SimulationError(msg)
+            raise SimulationError(f"{file}: wanted finite poses and trans; cut out the frames that aren't")
         name = file.relative_to(folder).with_suffix("").as_posix()
         clips.append(Clip(name, found.poses, found.transl, found.fps, found.notes))
     return clips

@@ -138,8 +138,7 @@ def produce(
     with locked(output):
         rows = Rows(output, simulator.kind, mode="r+")
         if not np.array_equal(rows.arrays["slot"], slots):
-            msg = f"{output}: holds other slots than this plan's; give another output directory"
-            raise SimulationError(msg)
+            raise SimulationError(f"{output}: holds other slots than this plan's; give another output directory")
         state, row_of = rows.arrays["state"], {int(slot): row for row, slot in enumerate(slots)}
         left = [[slot for slot in block if state[row_of[slot]] == TO_DO] for block in blocks]
         make_block: Callable[[], Callable[[list[int]], list[dict[str, Any]]]] = partial(_block_of, kind, *given)
@@ -207,8 +206,7 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
             write_card(output, card)
             return
     except OSError as error:
-        msg = f"{output}: can't be written: {error}"
-        raise SimulationError(msg) from error
+        raise SimulationError(f"{output}: can't be written: {error}") from error
     there, wanted = read_card(output, card["format"]), json.loads(json.dumps(card))
     differing = [key for key in _MUST_AGREE if there.get(key) != wanted[key]]
     if differing:

@@ -75,8 +75,7 @@ def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) 
     if not len(long):
         got = f"{lengths.max() / rate:.1f} s" if len(lengths) else "none"
         wanted = f"motions of {n_frames / FPS:g} s at least in training and test"
-        msg = f"wanted {wanted}, the longest has {got}: ask for less"
-        raise SimulationError(msg)
+        raise SimulationError(f"wanted {wanted}, the longest has {got}: ask for less")
     weights = np.sqrt(lengths[long])
     which = int(rng.choice(long, p=weights / weights.sum()))
     first = int(rng.integers(lengths[which] - n + 1))
@@ -119,8 +118,7 @@ class SequencePlan:
             msg = f"wanted a sequence and a shape at least, and two frames to 600 s, got {asdict(self)}"
             raise SimulationError(msg)
         if not (0 <= self.test_share < 1 and self.spread > 0):
-            msg = f"the test's share must lie in [0, 1) and the spread above 0, got {asdict(self)}"
-            raise SimulationError(msg)
+            raise SimulationError(f"the test's share must lie in [0, 1) and the spread above 0, got {asdict(self)}")
 
     @property
     def n_frames(self) -> int:

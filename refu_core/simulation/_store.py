@@ -73,8 +73,7 @@ def quantise(vertices: NDArray[np.floating]) -> NDArray[np.int16]:
     """Positions [m] within ±2 m in units of `QUANTUM`. Raises `SimulationError` for positions that don't fit."""
     units = np.rint(np.asarray(vertices, np.float64) / QUANTUM)
     if not np.abs(units).max(initial=0) < 2**15:
-        msg = "a garment more than 2 m away from its body can't be stored: the simulation has failed"
-        raise SimulationError(msg)
+        raise SimulationError("a garment more than 2 m away from its body can't be stored: the simulation has failed")
     return units.astype(np.int16)
 
 
@@ -99,8 +98,7 @@ class Rows:
         """
         self.directory = output / _ROWS
         if not has_rows(output):
-            msg = f"{output}: no shard: wanted a folder {_ROWS} beside the card"
-            raise SimulationError(msg)
+            raise SimulationError(f"{output}: no shard: wanted a folder {_ROWS} beside the card")
         self.arrays: dict[str, Any] = {
             name: _mapped(self.directory / f"{name}.npy", mode) for name in columns_of(kind, ())
         }
@@ -160,12 +158,10 @@ def _mapped(path: Path, mode: Literal["r", "r+"] = "r") -> NDArray[Any]:
         with open_file(path, most=_MAX_BYTES, error=SimulationError, wanted="a column of a data set") as file:
             rows = check_npy(file, file.size)[0][:1]  # numpy would lengthen a file that was cut short
         if rows > (_MAX_ROWS,):
-            msg = f"{rows[0]} rows, at most {_MAX_ROWS} are read"
-            raise ValueError(msg)
+            raise ValueError(f"{rows[0]} rows, at most {_MAX_ROWS} are read")
         array: NDArray[Any] = np.load(path, mmap_mode=mode)
     except DAMAGE as error:
-        msg = f"{path}: not a column of a data set, or a damaged one: {error}"
-        raise SimulationError(msg) from error
+        raise SimulationError(f"{path}: not a column of a data set, or a damaged one: {error}") from error
     return array
 
 
@@ -203,6 +199,5 @@ def read_unseen(directory: Path, count: int) -> NDArray[np.float32]:
         return np.broadcast_to(np.float32(np.nan), count)
     found = _mapped(path)
     if found.shape != (count,) or found.dtype != np.float32:
-        msg = f"{path}: wanted float32 of shape {(count,)}, got {found.dtype} of {found.shape}"
-        raise SimulationError(msg)
+        raise SimulationError(f"{path}: wanted float32 of shape {(count,)}, got {found.dtype} of {found.shape}")
     return found

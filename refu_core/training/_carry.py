@@ -84,8 +84,7 @@ class CarrySettings:
     def __post_init__(self) -> None:
         """Raises `RefuError` for sizes that make no network."""
         if min(self.rank, self.poses, self.steps, *self.hidden) < 1 or not self.ridge > 0:
-            msg = f"rank, poses, steps, layers and ridge must be above zero, got {self}"
-            raise RefuError(msg)
+            raise RefuError(f"rank, poses, steps, layers and ridge must be above zero, got {self}")
 
 
 class Carried:

@@ -272,8 +272,7 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     """
     n = len(values)
     if n < 2:  # to learn it well takes hundreds
-        msg = f"an output basis needs 2 samples at least, got {n}: simulate more"
-        raise RefuError(msg)
+        raise RefuError(f"an output basis needs 2 samples at least, got {n}: simulate more")
     rank = min(rank, n - 1)
     mean = values.mean(0)
     centred = (values - mean).flatten(1)

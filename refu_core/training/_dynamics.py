@@ -101,8 +101,7 @@ def train_dynamics(
     stored = load_weights(folder / f"tailornet-{mode}", expect=opened.identity)
     still = backbone_from_weights(stored, template)
     if not isinstance(still, TailorNet):
-        msg = f"{stored.path}: wanted a tailornet, got {type(still).__name__}"
-        raise RefuError(msg)
+        raise RefuError(f"{stored.path}: wanted a tailornet, got {type(still).__name__}")
     settings = DynamicsSettings() if settings is None else settings
     torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):

@@ -126,8 +126,7 @@ def finetune(
         WeightsError: no such backbone or preset, weights that are missing, damaged or of another garment.
     """
     if mode not in _MODES:
-        msg = f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}"
-        raise RefuError(msg)
+        raise RefuError(f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}")
     settings = settings or FinetuneSettings.of(backbone, preset)
     opened = TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity

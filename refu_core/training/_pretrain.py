@@ -148,8 +148,7 @@ def pretrain(
     test = read_samples(opened.rows, body, template, split="test")  # a missing test split is reported first
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
     if start is None and (rehearsal is not None or joints or mode != "none"):
-        msg = "there is nothing to go on from or to rehearse without weights to start from"
-        raise RefuError(msg)
+        raise RefuError("there is nothing to go on from or to rehearse without weights to start from")
     torch_device, output = start_parallel(device), Path(output)
     stem = output / f"{backbone}-{mode}"
     mirror = Mirror.of(template) if settings.is_mirrored else None
@@ -238,8 +237,7 @@ def bring_basis(source: Path, target: Path, *, written: str) -> None:
             with replacing(there, sync=True) as file:
                 file.write((source / name).read_bytes())
         except OSError as error:
-            msg = f"{there}: can't be written: {error.strerror or error}"
-            raise WeightsError(msg) from error
+            raise WeightsError(f"{there}: can't be written: {error.strerror or error}") from error
 
 
 def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:

@@ -34,8 +34,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
         with replacing(path, sync=True) as file:
             file.write(buffer.getbuffer())
     except OSError as error:
-        msg = f"{path}: the checkpoint can't be written: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{path}: the checkpoint can't be written: {error}") from error
 
 
 def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] | None:
@@ -50,14 +49,12 @@ def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] |
     try:
         state = torch.load(_as_saved(path), map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever its readers do
-        msg = f"{path}: a damaged checkpoint; delete it to start anew: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{path}: a damaged checkpoint; delete it to start anew: {error}") from error
     if not isinstance(state, dict):
         msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
         raise WeightsError(msg)
     if identity is not None and state.get("identity") != identity:
-        msg = f"{path}: of a training with other settings or data; delete it to start anew"
-        raise RefuError(msg)
+        raise RefuError(f"{path}: of a training with other settings or data; delete it to start anew")
     return state
 
 

@@ -68,8 +68,7 @@ class SdfSettings:
             msg = f"no preset {self.preset!r} of the distance network: wanted one of {', '.join(SDF_PRESETS)}"
             raise RefuError(msg)
         if min(self.steps, self.batch_size, self.check_every) < 1 or self.points < 8 or not self.learning_rate > 0:
-            msg = f"steps, batch_size, points (8 or more) and rates must be positive, got {asdict(self)}"
-            raise RefuError(msg)
+            raise RefuError(f"steps, batch_size, points (8 or more) and rates must be positive, got {asdict(self)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +209,7 @@ def train_sdf(
     where = start_parallel(device)
     rank, world = ranks()
     if settings.batch_size % world:
-        msg = f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes"
-        raise RefuError(msg)
+        raise RefuError(f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes")
     splits = _split(dataset, settings)
     samplers = {part: SdfSampler(dataset, body, garment, rows) for part, rows in splits.items()}
     checks = {part: _fixed_batch(samplers[part], settings).to(where) for part in ("validation", "test")}
@@ -279,8 +277,7 @@ def _split(dataset: GarmentDataset, settings: SdfSettings) -> dict[str, Tensor]:
     splits = {"train": train & ~held_out, "validation": train & held_out, "test": test}
     for name, mask in splits.items():
         if not bool(mask.any()):
-            msg = f"the set has no finished sample for the {name} part: let `refu simulate` run longer"
-            raise RefuError(msg)
+            raise RefuError(f"the set has no finished sample for the {name} part: let `refu simulate` run longer")
     return {name: torch.nonzero(mask)[:, 0] for name, mask in splits.items()}
 
 

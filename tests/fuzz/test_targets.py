@@ -105,7 +105,7 @@ def test_who_keeps_it_is_counted() -> None:
     assert contract.hold(lambda _: None, b"")
 
     def refuse(_: Any) -> None:
-        raise BagError("no bag")  # noqa: EM101
+        raise BagError("no bag")
 
     assert not contract.hold(refuse, b"")
     assert (contract.executions, contract.refused) == (2, 1)

@@ -171,7 +171,7 @@ def test_wrong_distances_are_noticed(kind: str, subject: Subject, monkeypatch: p
 
 def test_errors_of_other_kinds_are_failures_and_refusals_are_not(subject: Subject) -> None:
     def refuse(_subject: Subject, _trial: Trial) -> Measurement:
-        raise StressError("too far")  # noqa: EM101
+        raise StressError("too far")
 
     def break_down(_subject: Subject, _trial: Trial) -> Measurement:
         raise ZeroDivisionError
