@@ -17,8 +17,7 @@ from refu_core._npz import MAX_TEXT_BYTES, read_npz
 from refu_core.body import BUILTIN_BODIES
 from refu_core.errors import GarmentError, MeshError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
-from refu_core.garments._card import GarmentCard, card_to_json, json_to_card
-from refu_core.garments._template import GarmentTemplate, UvMap
+from refu_core.garments._template import GarmentCard, GarmentTemplate, UvMap, card_to_json, json_to_card
 from refu_core.mesh import check_faces
 from refu_core.modes import BUILTIN_GARMENTS, GARMENT_FILE
 

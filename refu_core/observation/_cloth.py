@@ -23,6 +23,9 @@ from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_normals
 from refu_core.observation._match_kernels import match_kernel
 
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationSettings:
@@ -109,7 +112,6 @@ def _subspace(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float64]
     return np.sqrt(n) * (block @ turn)[:, :count], value[:count]
 
 
-F64 = NDArray[np.float64]
 _AT_ONCE = 1e-9
 """Time counts only once at least this share of the prior's variance comes back in it."""
 
@@ -172,7 +174,6 @@ def _inverse(matrix: F64) -> F64:
     return np.asarray(half)
 
 
-F32 = NDArray[np.float32]
 _OFF_CENTRE = 0.37
 """Offset of the grid [cells]: if the body's plane of symmetry were a border, the last bit would choose the cell."""
 

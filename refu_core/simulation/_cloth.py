@@ -19,6 +19,9 @@ from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, linked, vertex_areas
 from refu_core.sdf import ExactSdf
 
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+
 
 @dataclass(frozen=True, eq=False)
 class ClothTopology:
@@ -80,8 +83,6 @@ def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
     return found
 
 
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
 _Contacts = tuple[I32, F32, F32, F32]
 """Vertices, or both ends of edges; and for each the place on the skin, its normal and its motion in a substep."""
 

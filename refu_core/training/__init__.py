@@ -2,14 +2,14 @@
 
 from refu_core.training._carry import CarrySettings as CarrySettings
 from refu_core.training._carry import carry_over as carry_over
+from refu_core.training._dresser import collision_loss as collision_loss
+from refu_core.training._dresser import reconstruction_loss as reconstruction_loss
+from refu_core.training._dresser import refu_loss as refu_loss
 from refu_core.training._dynamics import DynamicsSettings as DynamicsSettings
 from refu_core.training._dynamics import train_dynamics as train_dynamics
 from refu_core.training._finetune import FinetuneSettings as FinetuneSettings
 from refu_core.training._finetune import finetune as finetune
 from refu_core.training._loop import LoopSettings as LoopSettings
-from refu_core.training._losses import collision_loss as collision_loss
-from refu_core.training._losses import reconstruction_loss as reconstruction_loss
-from refu_core.training._losses import refu_loss as refu_loss
 from refu_core.training._pretrain import PretrainSettings as PretrainSettings
 from refu_core.training._pretrain import pretrain as pretrain
 from refu_core.training._record import TrainingLog as TrainingLog

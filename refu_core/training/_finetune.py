@@ -32,9 +32,8 @@ from refu_core.training._data import (
     mirrored,
     split_validation,
 )
-from refu_core.training._dresser import Dresser, Sdf
+from refu_core.training._dresser import Dresser, Sdf, refu_loss
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._losses import refu_loss
 from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages
 from refu_core.weights import load_weights
 
