@@ -28,17 +28,12 @@ from refu_core.weights import Weights, build_for, config_of_card, load_weights, 
 PRESETS: tuple[str, ...] = ("realtime", "paper")
 """`realtime` has low-rank heads and sizes for a CPU, `paper` the sizes of the paper."""
 
-_CONFIGS: dict[str, type[TailorNetConfig] | type[MlpConfig] | type[GcnnConfig]] = {
-    "tailornet": TailorNetConfig,
-    "mlp": MlpConfig,
-    "gcnn": GcnnConfig,
-}
-TRAINABLE: tuple[str, ...] = tuple(_CONFIGS)
-"""Backbones that have weights."""
-
 BackboneConfig = TailorNetConfig | MlpConfig | GcnnConfig
 Network = TailorNet | Mlp | Gcnn
 """A backbone that is trained."""
+_CONFIGS: dict[str, type[BackboneConfig]] = {"tailornet": TailorNetConfig, "mlp": MlpConfig, "gcnn": GcnnConfig}
+TRAINABLE: tuple[str, ...] = tuple(_CONFIGS)
+"""Backbones that have weights."""
 
 
 def backbone_config(name: str, garment: GarmentTemplate, *, preset: str = "realtime") -> BackboneConfig:
@@ -72,18 +67,6 @@ def build_backbone(
     if pivots is None:
         raise WeightsError("a tailornet needs pivots: (β, γ) of the style-shape pairs of its high-frequency nets")
     return TailorNet(config, garment, decoder, pivots)
-
-
-def backbone_name(config: BackboneConfig) -> str:
-    """The name of the backbone that has this configuration."""
-    return next(name for name, kind in _CONFIGS.items() if isinstance(config, kind))
-
-
-def config_from_card(name: str, values: Any) -> BackboneConfig:
-    """The configuration that a card has as `values`. Raises `WeightsError` unless it fits the backbone `name`."""
-    if name not in _CONFIGS:
-        raise WeightsError(f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again")
-    return config_of_card(_CONFIGS[name], values)
 
 
 _PREFIX = "backbone."
@@ -138,7 +121,8 @@ def save_backbone(
     state = {k: v for k, v in backbone.state_dict().items() if not k.startswith("decoder.")}
     # Buffers (pivots, standardisation) stay exact: the kernel of the mixture is narrow.
     tensors = {_PREFIX + k: v.half() if half and k in parameters else v for k, v in state.items()}
-    described: dict[str, Any] = {"backbone": backbone_name(backbone.config), "config": asdict(backbone.config)}
+    name = next(name for name, kind in _CONFIGS.items() if isinstance(backbone.config, kind))
+    described: dict[str, Any] = {"backbone": name, "config": asdict(backbone.config)}
     if not isinstance(backbone, Gcnn) and isinstance(backbone.decoder, BasisDecoder):
         stored = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
         described["basis_sha256"] = str(stored.card["sha256"])
@@ -154,7 +138,10 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
     Raises `WeightsError`: they are for another version or garment, or their basis is missing, damaged or replaced.
     """
     card, template = weights.card, garment.to(device="cpu")
-    config = config_from_card(str(card.get("backbone")), card.get("config"))
+    name = str(card.get("backbone"))
+    if name not in _CONFIGS:
+        raise WeightsError(f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again")
+    config = config_of_card(_CONFIGS[name], card.get("config"))
     basis = None
     if "basis_sha256" in card:
         identity = {key: card[key] for key in ("garment", "body_fingerprint") if key in card}

@@ -99,8 +99,6 @@ class LimbContacts:
         asked, *outputs = (wp.array(one, dtype=kind, device="cpu", copy=False) for one, kind in kinds)
         wp.launch(kernels.pressed_kernel, n, [asked, self._parts, PRESSED, _OPPOSED], outputs, device="cpu")
         rows = np.flatnonzero(pair >= 0)
-        if not len(rows):
-            return pair[rows], np.empty((0, 5))
         area = vertex_areas(points, faces[(pair[faces] >= 0).any(axis=1)])
         return pair[rows], np.column_stack((area[rows], depth[rows], points[rows]))
 

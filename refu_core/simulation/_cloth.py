@@ -47,15 +47,9 @@ class ClothTopology:
         bends = np.stack((by_edge[first[inner]], by_edge[first[inner] + 1]), 1)
         return ClothTopology(mesh, _by_colour(mesh.edges), _by_colour(bends))
 
-    @property
-    def n_vertices(self) -> int:
-        """Number of vertices N."""
-        return self.mesh.n_vertices
-
     def boundary_loops(self) -> list[NDArray[np.intp]]:
         """Vertices of each hem (waist, cuff, neckline), each sorted by index, in the order of their lowest index."""
-        rim = self.mesh.boundary
-        n = self.n_vertices
+        rim, n = self.mesh.boundary, self.mesh.n_vertices
         _, label = linked(rim, n)
         on_rim = np.zeros(n, bool)
         on_rim[rim] = True
@@ -65,7 +59,7 @@ class ClothTopology:
         """Shortest path along the edges from any of `sources` to each of `vertices` (N, 3) [m], shape (N,)."""
         i, j = self.mesh.edges.T
         length = np.linalg.norm(vertices[i] - vertices[j], axis=1) + 1e-9
-        graph = coo_array((length, (i, j)), shape=(self.n_vertices,) * 2).tocsr()
+        graph = coo_array((length, (i, j)), shape=(len(vertices),) * 2).tocsr()
         return np.asarray(dijkstra(graph, directed=False, indices=sources, min_only=True))
 
 
@@ -171,7 +165,7 @@ class SimulatedCloth:
         self.topology = topology
         self._sdf = sdf
         self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
-        n = topology.n_vertices
+        n = topology.mesh.n_vertices
         # Bends first: in each sweep the stiffer edges have the last word.
         ends = np.concatenate((topology.bends, topology.edges))
         self._ends = ends.astype(np.uint32)  # unsigned: no check for indices that count from the end
@@ -202,7 +196,7 @@ class SimulatedCloth:
         `waist` vertices are held at the place on the skin that is closest to them in the rest pose: the body at rest is
         `body_rest` (V, 3).
         """
-        n, n_edges = self.topology.n_vertices, len(self.topology.mesh.edges)
+        n, n_edges = len(rest), len(self.topology.mesh.edges)
         self._told_apart: F32 = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
         self._skin, self._middles = _Skin(n), _Skin(n_edges)
         self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: the first call searches

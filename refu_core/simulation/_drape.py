@@ -197,9 +197,9 @@ class Draper:
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
         self._collider = Collider(body, gap=self.settings.gap)
-        self.cloth = SimulatedCloth(
-            self.topology, sdf, piece=self.outfit.number_of_vertex, settings=self.settings.cloth
-        )
+        counts = [garment.n_vertices for garment in self.outfit.garments]
+        piece = np.repeat(np.arange(len(counts)), counts)
+        self.cloth = SimulatedCloth(self.topology, sdf, piece=piece, settings=self.settings.cloth)
         self._waist = self._waists()
         self._untangle = Untangle(garment.mesh, sdf, margin=self.settings.cloth.margin)
         self._comfort = np.concatenate((COMFORT_POSES, CROOK_POSE[None]))
