@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +16,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
 from refu_core.training._data import check_set, drawn_pairs
-from refu_core.training._loop import cosine, is_writer, ranks, start_parallel
-from refu_core.training._record import TrainingLog, load_checkpoint, save_checkpoint
+from refu_core.training._loop import Loop, LoopSettings, TrainingStage, cosine, is_writer, ranks, start_parallel
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
 """λ_a, λ_b and λ_c of the paper's loss."""
@@ -217,43 +214,23 @@ def train_sdf(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         network = SdfNetwork(SDF_PRESETS[settings.preset]).to(where)
-    optimiser = torch.optim.Adam(network.parameters(), lr=settings.learning_rate)
     about = {"garment": garment.name, "samples": len(splits["train"])}
-    identity = json.dumps({**asdict(settings), "body": body.fingerprint, **about})
-    checkpoint = output / f"{name}.checkpoint"
-    saved, step = load_checkpoint(checkpoint, identity), 0
-    if saved is not None:
-        network.load_state_dict(saved["network"])
-        optimiser.load_state_dict(saved["optimiser"])
-        step = int(saved["step"])
-    module: nn.Module = _Step(network)
-    if world > 1:
-        module = nn.parallel.DistributedDataParallel(module)
-    log = TrainingLog(output, name=name, quiet=quiet, is_writer=is_writer())
-    log.begin("sdf", step=step, steps=settings.steps)
-    while step < settings.steps:
+    identity = [asdict(settings), body.fingerprint, about]
+    how = LoopSettings(settings.batch_size, settings.learning_rate, 0.0, settings.check_every, seed=settings.seed)
+    loop = Loop(network, how, output / name, identity, where, quiet=quiet)
+
+    def draw(step: int) -> SdfBatch:
         generator = torch.Generator().manual_seed((settings.seed * 1_000_003 + step) * world + rank)
-        batch = samplers["train"].draw(
-            generator, bodies=settings.batch_size // world, points=settings.points, noise=settings.noise
-        )
-        with torch.autocast(where.type, torch.bfloat16, enabled=where.type == "cuda"):
-            loss = module(batch.to(where))
-        for group in optimiser.param_groups:
-            group["lr"] = settings.rate(step)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-        step += 1
-        log.step(step)
-        if step % settings.check_every == 0 or step == settings.steps:
-            if not math.isfinite(lost := float(loss.detach())):
-                msg = f"the loss of the distance network is {lost} at step {step}: try a smaller learning rate"
-                raise RefuError(msg)
-            if is_writer():
-                found = sdf_figures(network, checks["validation"])
-                log.check("sdf", step, absolute=found["absolute_mm"], near_skin=found["near_mm"])
-                state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
-                save_checkpoint(checkpoint, {"identity": identity, "step": step, **state})
+        bodies = settings.batch_size // world
+        batch = samplers["train"].draw(generator, bodies=bodies, points=settings.points, noise=settings.noise)
+        return batch.to(where)
+
+    def watch() -> dict[str, float]:
+        found = sdf_figures(network, checks["validation"])
+        return {"absolute": found["absolute_mm"], "near_skin": found["near_mm"]}
+
+    hooks: dict[str, Any] = {"draw": draw, "learning_rate": settings.rate, "watch": watch}
+    loop.run(TrainingStage("sdf", _Step(network), settings.steps, **hooks))
     card = {
         "kind": "sdf",
         "body_fingerprint": body.fingerprint,
@@ -261,10 +238,9 @@ def train_sdf(
         "settings": asdict(settings),
         "figures": {part: sdf_figures(network, batch) for part, batch in checks.items()},
     }
-    log.end()
     if is_writer():
         save_sdf_network(output / name, network, card)
-        checkpoint.unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
