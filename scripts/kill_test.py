@@ -178,7 +178,7 @@ class Training:
 
     def check(self, folder: Path) -> str:
         """Checkpoint, weights and curves are there whole, or not at all."""
-        from refu_core.training._record import load_checkpoint
+        from refu_core.training import load_checkpoint
         from refu_core.weights import load_weights
 
         for path in folder.glob("*.safetensors"):

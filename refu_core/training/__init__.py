@@ -13,6 +13,7 @@ from refu_core.training._loop import LoopSettings as LoopSettings
 from refu_core.training._pretrain import PretrainSettings as PretrainSettings
 from refu_core.training._pretrain import pretrain as pretrain
 from refu_core.training._record import TrainingLog as TrainingLog
+from refu_core.training._record import load_checkpoint as load_checkpoint
 from refu_core.training._rehearsal import Rehearsal as Rehearsal
 from refu_core.training._sdf import SdfSettings as SdfSettings
 from refu_core.training._sdf import train_sdf as train_sdf
