@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 JOINT_NAMES: tuple[str, ...] = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
@@ -18,3 +19,18 @@ CARRIED = np.eye(len(PARENTS))
 """1 where a joint (row) moves when another (column) turns: it hangs from that one, or is that one, shape (24, 24)."""
 for _joint, _parent in enumerate(PARENTS[1:], start=1):
     CARRIED[_joint] += CARRIED[_parent]
+
+
+def posed(turns: str) -> NDArray[np.float64]:
+    """The pose that a text tells, rotation vectors, zero for joints that it doesn't name, shape (24, 3).
+
+    In "neck 0.1 0 0, both_hip -1 0 0.2" the left hip is turned as told, the right one as its mirror image.
+    """
+    pose = np.zeros((len(JOINT_NAMES), 3))
+    for name, *numbers in map(str.split, filter(None, turns.split(", "))):
+        turn = np.array(numbers, np.float64)
+        if name.startswith("both_"):
+            pose[JOINT_NAMES.index(name.replace("both", "right"))] = 0.0 - turn * (-1, 1, 1)
+            name = name.replace("both", "left")
+        pose[JOINT_NAMES.index(name)] = turn
+    return pose

@@ -30,9 +30,8 @@ from refu_core.frames import N_BETAS
 from refu_core.garments import BUILTIN_GARMENTS, N_STYLES, GarmentTemplate, load_garment
 from refu_core.mesh import vertex_areas
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._cloth import F32
+from refu_core.simulation._cloth import F32, ClothTopology
 from refu_core.simulation._drape import Draper
-from refu_core.simulation._mesh import ClothTopology
 
 F64 = NDArray[np.float64]
 _CLEARANCE = 0.005

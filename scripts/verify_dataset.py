@@ -34,7 +34,7 @@ from tqdm import tqdm
 from refu_core.body import Collider, load_body
 from refu_core.garments import load_garment
 from refu_core.simulation import colliders
-from refu_core.simulation._drape import comfort_poses
+from refu_core.simulation._drape import COMFORT_POSES
 from refu_core.simulation._joined import JoinedGarments
 
 F64 = NDArray[np.float64]
@@ -109,7 +109,7 @@ class Judge:
         key = shape.numpy().tobytes() + style.tobytes()
         if self._lengths is None or self._lengths[0] != key:
             rest = self._garment.rest(shape, self._garment.own(torch.from_numpy(style)[None]))
-            poses = comfort_poses()
+            poses = COMFORT_POSES
             eased = self._garment.pose(rest.expand(len(poses), -1, -1), self._body(poses, shape).transforms)
             both = torch.cat((rest, eased)).numpy().astype(np.float64)
             length = np.linalg.norm(both[:, self._edges[:, 0]] - both[:, self._edges[:, 1]], axis=-1)

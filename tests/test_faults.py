@@ -34,7 +34,7 @@ from refu_core import GarmentPipeline, SmplFrame, WeightsError, load_body
 from refu_core._device import is_device_loss
 from refu_core.backbones import TailorNetConfig
 from refu_core.outputs import Fittings
-from refu_core.training import load_checkpoint, save_checkpoint
+from refu_core.training._record import load_checkpoint, save_checkpoint
 from refu_core.weights import save_weights
 from refu_lab.cli import main
 from refu_ros._diagnostics import Situation, statuses

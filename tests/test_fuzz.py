@@ -18,7 +18,8 @@ from refu_core import BodyError, WeightsError, load_body
 from refu_core.options import SettingsError
 from refu_core.simulation import SimulationError, load_clips
 from refu_core.simulation._store import FORMAT, Rows
-from refu_core.training import TrainingLog, load_checkpoint, save_checkpoint
+from refu_core.training import TrainingLog
+from refu_core.training._record import load_checkpoint, save_checkpoint
 from refu_ros._settings import NodeSettings
 from tests.fuzz.containers import join_mcap, mcap_chunk, split_mcap
 

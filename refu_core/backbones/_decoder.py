@@ -3,18 +3,89 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
+from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.linalg import splu
 from torch import Tensor, nn
 from torch.nn import functional
 
 from refu_core._warp import Repeated, is_plain
-from refu_core.backbones._controls import Controls
 from refu_core.backbones._decode_kernels import WIDTH, Steps, Strip, decode_kernel
 from refu_core.errors import WeightsError
+from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate
+from refu_core.mesh import Connectivity
+
+_HOLD = 100.0
+"""How much more a control's own value weighs than the smoothness at a vertex."""
+_NEVER_SINGULAR = 1e-9
+"""Keeps the matrix from being singular: a piece of cloth without a control doesn't move."""
+
+
+@dataclass(frozen=True, eq=False)
+class Controls:
+    """Vertices of a garment whose values determine those of all others, smoothly, as in a least-squares mesh.
+
+    Sorkine and Cohen-Or (2004): each vertex is the mean of its neighbours, as far as the controls' values allow.
+    """
+
+    mesh: Connectivity
+    """The garment's."""
+    vertices: Tensor
+    """Which of its vertices are controls, int32, shape (C,)."""
+
+    @classmethod
+    def of(cls, garment: GarmentTemplate, vertices: Tensor) -> Controls:
+        """With these vertices (C,). Raises `WeightsError` unless they are vertices of the garment, each once."""
+        numbers = vertices.tolist() if vertices.ndim == 1 and not vertices.is_floating_point() else []
+        inside = bool(numbers) and 0 <= min(numbers) <= max(numbers) < garment.n_vertices
+        if not inside or len(set(numbers)) < len(numbers):
+            msg = f"wanted controls among the {garment.n_vertices} vertices of {garment.name}, each once, got "
+            msg += f"{vertices.dtype} {tuple(vertices.shape)}: get the weights again"
+            raise WeightsError(msg)
+        return cls(garment.mesh, vertices.to(torch.int32))
+
+    @classmethod
+    def spread(cls, garment: GarmentTemplate, count: int) -> Controls:
+        """`count` controls, each new one where it is farthest along the cloth from all before it."""
+        points, (first, second) = garment.v_template.cpu().double().numpy(), garment.mesh.edges.T
+        length = np.linalg.norm(points[first] - points[second], axis=1)
+        graph = sparse.csr_array((length, (first, second)), (len(points), len(points)))
+        chosen, way = [0], np.full(len(points), np.inf)
+        while len(chosen) < min(count, len(points)):
+            way = np.minimum(way, dijkstra(graph, directed=False, indices=[chosen[-1]])[0])
+            chosen.append(int(way.argmax()))
+        return cls(garment.mesh, torch.tensor(chosen, dtype=torch.int32))
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """The field at all vertices, float32, shape (N, V, K), from its values at the controls (N, C, K)."""
+        n_fields, n_controls, width = values.shape
+        n, at = self.mesh.n_vertices, self.vertices.numpy()
+        bend = self.mesh.uniform_laplacian()
+        hold = np.full(n, _NEVER_SINGULAR)
+        hold[at] += _HOLD
+        known = np.zeros((n, n_fields * width))
+        known[at] = _HOLD * values.detach().cpu().double().numpy().transpose(1, 0, 2).reshape(n_controls, -1)
+        # The matrix is symmetric and positive; unless the solver is told so, its factors are several times as large.
+        solver = splu(
+            (bend.T @ bend + sparse.diags(hold)).tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        field = torch.from_numpy(solver.solve(known)).float()
+        return field.view(n, n_fields, width).transpose(0, 1).contiguous()
+
+    def matrix(self) -> Tensor:
+        """The weight of each control at each vertex, shape (V, C)."""
+        return self(torch.eye(len(self.vertices))[None])[0]
+
 
 _A_FEW = 16
 """For more codes than this, a product of matrices is faster."""
@@ -43,7 +114,7 @@ class DenseDecoder(nn.Module):
 
     def directions(self, garment: GarmentTemplate) -> Tensor:
         """How a unit of each of (β, γ) changes the template, as codes [m], shape (14, 3 V)."""
-        return _template_directions(garment)
+        return _directions(garment)
 
 
 class BasisDecoder(nn.Module):
@@ -65,8 +136,7 @@ class BasisDecoder(nn.Module):
         """
         super().__init__()
         if components.ndim != 2 or components.shape[1] != mean.numel():
-            msg = f"wanted a basis of (R, {mean.numel()}), got {tuple(components.shape)}: get them again"
-            raise WeightsError(msg)
+            raise WeightsError(f"wanted a basis of (R, {mean.numel()}), got {tuple(components.shape)}: get them again")
         self.controls = controls
         self._at_controls = None
         if controls is not None:
@@ -93,15 +163,12 @@ class BasisDecoder(nn.Module):
 
         Raises `WeightsError` where something is missing, or parts don't fit each other or the garment.
         """
-        missing = [name for name in ("mean", "components") if name not in tensors]
-        if missing:
-            msg = f"has no {' and no '.join(missing)}: not an output basis"
-            raise WeightsError(msg)
+        if missing := [name for name in ("mean", "components") if name not in tensors]:
+            raise WeightsError(f"has no {' and no '.join(missing)}: not an output basis")
         coarse = tensors["components"].float()
         if "controls" in tensors:
             if garment is None:
-                msg = "is known at controls alone: say whose basis it is"
-                raise WeightsError(msg)
+                raise WeightsError("is known at controls alone: say whose basis it is")
             return cls(tensors["mean"].float(), coarse, controls=Controls.of(garment, tensors["controls"]))
         nothing = torch.zeros(0, *coarse.shape[1:], dtype=torch.int8)
         stored = _Stored(coarse, tensors.get("fine", nothing), tensors.get("steps", coarse.new_zeros(0)).float())
@@ -124,7 +191,7 @@ class BasisDecoder(nn.Module):
 
         The first R columns are in the basis, the others in an orthonormal basis of what lies outside of it.
         """
-        whole = _template_directions(garment)
+        whole = _directions(garment)
         inside = whole @ self.components.T
         outside = torch.linalg.qr((whole - inside @ self.components).T).R.T
         return torch.cat((inside, outside), 1)
@@ -211,8 +278,6 @@ def _in_strips(rows: Tensor) -> Tensor:
 Decoder = DenseDecoder | BasisDecoder
 
 
-def _template_directions(garment: GarmentTemplate) -> Tensor:
-    styledirs = garment.styledirs
-    if styledirs is None:
-        styledirs = garment.shapedirs.new_zeros(len(garment.shapedirs), 4)
-    return torch.cat((garment.shapedirs, styledirs), 1).T.contiguous()
+def _directions(garment: GarmentTemplate) -> Tensor:
+    shape, style = garment.shapedirs, garment.styledirs
+    return torch.cat((shape, shape.new_zeros(len(shape), N_STYLES) if style is None else style), 1).T.contiguous()

@@ -32,8 +32,7 @@ def up_in_root(pose: Tensor) -> Tensor:
 SEEN_TILT = (np.radians(40), np.radians(60))
 """No training clip tilts the pelvis beyond the first of these [rad], and networks are told of none beyond the second.
 On a lying person, a skirt was off by 30 to 46 mm and a T-shirt by 15 to 23; with this, by 32 to 44 and 12 to 18."""
-_MOST_TILT = 0.5
-"""The cosine of the second."""
+_MOST_TILT = 0.5  # the cosine of the second
 
 
 def told_up(up: Tensor) -> Tensor:
@@ -82,8 +81,7 @@ class PoseFeatures(nn.Module):
     def __init__(self, joints: tuple[int, ...], encoding: str) -> None:
         super().__init__()
         if encoding not in ENCODINGS:
-            msg = f"no pose encoding {encoding!r}: wanted {' or '.join(ENCODINGS)}"
-            raise RefuError(msg)
+            raise RefuError(f"no pose encoding {encoding!r}: wanted {' or '.join(ENCODINGS)}")
         self.encoding = encoding
         self.joints = tuple(j for j in joints if j != 0)
         self.size = 3 + 9 * len(self.joints) if encoding == "matrix" else 72

@@ -43,10 +43,8 @@ class GcnnConfig:
     def __post_init__(self) -> None:
         """Raises `WeightsError` for graphs that would take for ever to make."""
         if not 1 <= self.stride <= _MOST_STRIDE or not 1 <= len(self.channels) <= _MOST_LEVELS:
-            msg = (
-                f"wanted strides to {_MOST_STRIDE}, {_MOST_LEVELS} channels at most, got {self.stride}, {self.channels}"
-            )
-            raise WeightsError(msg)
+            wanted = f"strides to {_MOST_STRIDE}, {_MOST_LEVELS} channels at most"
+            raise WeightsError(f"wanted {wanted}, got {self.stride}, {self.channels}")
 
     @classmethod
     def paper(cls, joints: tuple[int, ...]) -> GcnnConfig:
@@ -77,28 +75,22 @@ class Neighbours:
         return Neighbours(index, np.arange(count.max())[None] < count[:, None])
 
 
-@dataclass(frozen=True, eq=False)
-class MeshGraph:
-    """A mesh's vertices and what is left of them after each sampling, finest first."""
+def sampled(mesh: Connectivity, *, levels: int, stride: int = 2) -> tuple[list[int], list[Neighbours]]:
+    """A mesh's vertex graph, sampled `levels` times, finest first.
 
-    sizes: tuple[int, ...]
-    """Vertices of each of the L + 1 levels."""
-    ups: tuple[Neighbours, ...]
-    """From level l + 1 to level l: the coarse vertices that each fine one depends on, shape (V_l, n)."""
-
-    @staticmethod
-    def of(mesh: Connectivity, *, levels: int, stride: int = 2) -> MeshGraph:
-        """Samples the vertex graph of a mesh `levels` times."""
-        links = mesh.adjacency_matrix()
-        sizes, ups = [mesh.n_vertices], []
-        for _ in range(levels):
-            kept = _sample(links, stride)
-            # A fine vertex is within stride - 1 links of a kept one; one more link blends between several.
-            ups.append(Neighbours.of(_within(links, stride)[:, kept]))
-            # Kept vertices that cover neighbouring vertices are neighbours.
-            links = _within(links, 2 * stride - 1)[kept][:, kept]
-            sizes.append(len(kept))
-        return MeshGraph(tuple(sizes), tuple(ups))
+    Returns how many vertices each of the levels + 1 graphs has, and from each graph to the next finer one the coarse
+    vertices that each fine one depends on.
+    """
+    links = mesh.adjacency_matrix()
+    sizes, ups = [mesh.n_vertices], []
+    for _ in range(levels):
+        kept = _sample(links, stride)
+        # A fine vertex is within stride - 1 links of a kept one; one more link blends between several.
+        ups.append(Neighbours.of(_within(links, stride)[:, kept]))
+        # Kept vertices that cover neighbouring vertices are neighbours.
+        links = _within(links, 2 * stride - 1)[kept][:, kept]
+        sizes.append(len(kept))
+    return sizes, ups
 
 
 def _sample(links: sparse.csr_array, stride: int) -> NDArray[np.int64]:
@@ -180,14 +172,14 @@ class Gcnn(WithoutWearerCode, nn.Module):
         super().__init__()
         self.config = config
         self.n_vertices = garment.n_vertices
-        graph = MeshGraph.of(garment.mesh, levels=len(config.channels), stride=config.stride)
+        sizes, ups = sampled(garment.mesh, levels=len(config.channels), stride=config.stride)
         self.features = PoseFeatures(config.joints, config.encoding)
-        n, m = self.features.size + N_STYLE_SHAPE, graph.sizes[-1] * config.channels[0]
+        n, m = self.features.size + N_STYLE_SHAPE, sizes[-1] * config.channels[0]
         self.head = Perceptron(n, config.hidden, m, activation=config.activation, dropout=config.dropout)
         ends = (*config.channels[1:], 3)
         self.layers = nn.ModuleList(
             UpConv(up, a, b, bases=config.bases, residual=config.residual)
-            for up, a, b in zip(reversed(graph.ups), config.channels, ends, strict=True)
+            for up, a, b in zip(reversed(ups), config.channels, ends, strict=True)
         )
         self.register_buffer("mean", torch.zeros(garment.n_vertices, 3))
         self.register_buffer("scale", torch.tensor(0.02))

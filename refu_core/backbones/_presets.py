@@ -1,43 +1,47 @@
-"""Backbones by name and preset, untrained."""
+"""Backbones by name: untrained, from a preset; and on disk, `<name>-<mode>` and, shared by low-rank heads, `basis`."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
+from refu_core._files import read_json
+from refu_core._warp import memory
 from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
+from refu_core.backbones._dynamics import Dynamic, Dynamics, DynamicsConfig
 from refu_core.backbones._gcnn import Gcnn, GcnnConfig
 from refu_core.backbones._mlp import Mlp, MlpConfig
+from refu_core.backbones._protocol import MAX_OFFSET, Backbone, Skinned
 from refu_core.backbones._tailornet import TailorNet, TailorNetConfig
 from refu_core.errors import WeightsError
-from refu_core.garments import GarmentTemplate
-from refu_core.weights import config_of_card
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.garments import GarmentTemplate, load_garment
+from refu_core.modes import BackboneName, SdfMode
+from refu_core.weights import Weights, build_for, config_of_card, load_weights, save_weights, weights_folder
 
 PRESETS: tuple[str, ...] = ("realtime", "paper")
 """`realtime` has low-rank heads and sizes for a CPU, `paper` the sizes of the paper."""
 
-_CONFIGS: dict[str, type[TailorNetConfig] | type[MlpConfig] | type[GcnnConfig]] = {
-    "tailornet": TailorNetConfig,
-    "mlp": MlpConfig,
-    "gcnn": GcnnConfig,
-}
-TRAINABLE: tuple[str, ...] = tuple(_CONFIGS)
-"""Backbones that have weights."""
-
 BackboneConfig = TailorNetConfig | MlpConfig | GcnnConfig
 Network = TailorNet | Mlp | Gcnn
 """A backbone that is trained."""
+_CONFIGS: dict[str, type[BackboneConfig]] = {"tailornet": TailorNetConfig, "mlp": MlpConfig, "gcnn": GcnnConfig}
+TRAINABLE: tuple[str, ...] = tuple(_CONFIGS)
+"""Backbones that have weights."""
 
 
 def backbone_config(name: str, garment: GarmentTemplate, *, preset: str = "realtime") -> BackboneConfig:
     """The configuration of the backbone `name` for a garment. Raises `WeightsError` for no such name or preset."""
     if name not in _CONFIGS:
-        msg = f"no backbone {name!r} that could be trained: wanted {', '.join(TRAINABLE)}"
-        raise WeightsError(msg)
+        raise WeightsError(f"no backbone {name!r} that could be trained: wanted {', '.join(TRAINABLE)}")
     if preset not in PRESETS:
-        msg = f"no preset {preset!r}: wanted {' or '.join(PRESETS)}"
-        raise WeightsError(msg)
+        raise WeightsError(f"no preset {preset!r}: wanted {' or '.join(PRESETS)}")
     config, joints = _CONFIGS[name], garment.card.joints
     return config.paper(joints) if preset == "paper" else config(joints)
 
@@ -48,11 +52,7 @@ def uses_basis(config: BackboneConfig, preset: str) -> bool:
 
 
 def build_backbone(
-    config: BackboneConfig,
-    garment: GarmentTemplate,
-    *,
-    basis: BasisDecoder | None = None,
-    pivots: Tensor | None = None,
+    config: BackboneConfig, garment: GarmentTemplate, *, basis: BasisDecoder | None = None, pivots: Tensor | None = None
 ) -> Network:
     """An untrained backbone for a garment.
 
@@ -65,19 +65,174 @@ def build_backbone(
     if isinstance(config, MlpConfig):
         return Mlp(config, decoder)
     if pivots is None:
-        msg = "a tailornet needs pivots: (β, γ) of the style-shape pairs of its high-frequency nets"
-        raise WeightsError(msg)
+        raise WeightsError("a tailornet needs pivots: (β, γ) of the style-shape pairs of its high-frequency nets")
     return TailorNet(config, garment, decoder, pivots)
 
 
-def backbone_name(config: BackboneConfig) -> str:
-    """The name of the backbone that has this configuration."""
-    return next(name for name, kind in _CONFIGS.items() if isinstance(config, kind))
+_PREFIX = "backbone."
 
 
-def config_from_card(name: str, values: Any) -> BackboneConfig:
-    """The configuration that a card has as `values`. Raises `WeightsError` unless it fits the backbone `name`."""
+def save_basis(folder: Path, basis: BasisDecoder, card: Mapping[str, Any]) -> Path:
+    """Writes the output basis of a garment, `folder`/basis. Raises `WeightsError` where that can't be done."""
+    return save_weights(folder / "basis", basis.tensors(), {**card, "rank": basis.size})
+
+
+def require_basis(folder: Path, digest: str | None, *, written: Sequence[str]) -> None:
+    """Raises `WeightsError` if a new basis would replace that of weights in the folder that aren't `written` anew.
+
+    The new basis has this `digest`; None for one that no weights in the folder were trained with.
+    """
+    for path in sorted(folder.glob("*.json")):
+        if path.stem in (*written, "basis"):
+            continue
+        card = read_json(path, error=WeightsError, wanted="the card of weights")
+        known = card.get("basis_sha256", digest) if isinstance(card, dict) else digest
+        if known != digest:
+            msg = f"{path}: was trained with another basis than what would be written beside it; use a new folder"
+            raise WeightsError(msg)
+
+
+def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:
+    """The output basis of a garment and its hash. Raises `WeightsError` as `refu_core.weights.load_weights` does."""
+    weights = load_weights(folder / "basis", expect=expect)
+    try:
+        basis = BasisDecoder.of_tensors(weights.tensors, garment)
+    except WeightsError as error:
+        raise WeightsError(f"{weights.path}: {error}") from error
+    return basis, str(weights.card["sha256"])
+
+
+def save_backbone(
+    stem: Path,
+    backbone: Network,
+    card: Mapping[str, Any],
+    *,
+    others: Mapping[str, Tensor] | None = None,
+    half: bool = True,
+) -> Path:
+    """Writes a backbone, without its basis, and its card: `stem` with suffixes; the basis lies in the same folder.
+
+    The card says `garment`, `body_fingerprint`, and whatever else is known. `others` are tensors that belong with it,
+    the ReFU layer's for instance, with another prefix. With `half` the parameters are stored in half precision.
+
+    Raises `WeightsError` for weights that aren't finite or can't be written, and for another basis in the folder.
+    """
+    parameters = dict(backbone.named_parameters())
+    state = {k: v for k, v in backbone.state_dict().items() if not k.startswith("decoder.")}
+    # Buffers (pivots, standardisation) stay exact: the kernel of the mixture is narrow.
+    tensors = {_PREFIX + k: v.half() if half and k in parameters else v for k, v in state.items()}
+    name = next(name for name, kind in _CONFIGS.items() if isinstance(backbone.config, kind))
+    described: dict[str, Any] = {"backbone": name, "config": asdict(backbone.config)}
+    if not isinstance(backbone, Gcnn) and isinstance(backbone.decoder, BasisDecoder):
+        stored = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
+        described["basis_sha256"] = str(stored.card["sha256"])
+        if not backbone.decoder.is_stored_as(stored.tensors):
+            msg = f"{stem}: the basis in this folder isn't the one that the backbone was trained with; use a new folder"
+            raise WeightsError(msg)
+    return save_weights(stem, {**tensors, **(others or {})}, {**described, **card})
+
+
+def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device: str | torch.device = "cpu") -> Network:
+    """The backbone in `weights`, with the basis beside them, in float32 and ready for use (`eval`).
+
+    Raises `WeightsError`: they are for another version or garment, or their basis is missing, damaged or replaced.
+    """
+    card, template = weights.card, garment.to(device="cpu")
+    name = str(card.get("backbone"))
     if name not in _CONFIGS:
-        msg = f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again"
+        raise WeightsError(f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again")
+    config = config_of_card(_CONFIGS[name], card.get("config"))
+    basis = None
+    if "basis_sha256" in card:
+        identity = {key: card[key] for key in ("garment", "body_fingerprint") if key in card}
+        basis, digest = load_basis(weights.path.parent, template, expect=identity)
+        if digest != card["basis_sha256"]:
+            raise WeightsError(f"{weights.path}: made for another basis than the one beside it; get both files again")
+    tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
+    build = partial(build_backbone, config, template, basis=basis, pivots=tensors.get("pivots"))
+    try:
+        module = build_for(tensors, build, shared="decoder.")
+    except WeightsError as error:
+        raise WeightsError(f"{weights.path}: doesn't fit {garment.name}: {error}") from error
+    module = module.float().to(device).eval()
+    with torch.no_grad():
+        rest = memory(1, N_BETAS, device=device), memory(1, N_JOINTS, 3, device=device)
+        at_rest = module(*rest, None)
+    offset = 0.0 if at_rest is None else float(at_rest.abs().max())
+    if not offset <= MAX_OFFSET:  # also refuses NaN
+        msg = f"{weights.path}: wanted a garment within {MAX_OFFSET:g} m of a body at rest, this one is "
+        msg += f"{offset:.3g} m off; train it again"
         raise WeightsError(msg)
-    return config_of_card(_CONFIGS[name], values)
+    return module
+
+
+def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> Path:
+    """Writes a garment's dynamics, `folder`/dynamics. Raises `WeightsError` also if there is no basis."""
+    basis = load_weights(folder / "basis", expect={"garment": card["garment"]})
+    described = {"config": asdict(dynamics.config), "basis_sha256": str(basis.card["sha256"])}
+    parameters = dict(dynamics.named_parameters())
+    tensors = {k: v.half() if k in parameters else v for k, v in dynamics.state_dict().items()}
+    return save_weights(folder / "dynamics", tensors, {**described, **card})
+
+
+def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
+    """The backbone `name`: the `network` made from `weights`, with the dynamics beside them if it wants those.
+
+    Raises `WeightsError`: the network isn't a tailornet, or the dynamics are missing, damaged, or made for another
+    basis.
+    """
+    there = weights.path.with_name("dynamics.json").exists()
+    if name != BackboneName.DYNAMIC and not (name == BackboneName.AUTO and there):
+        return network
+    if not isinstance(network, TailorNet):
+        raise WeightsError(f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}")
+    expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
+    stored = load_weights(weights.path.with_name("dynamics"), expect=expect)
+    config = config_of_card(DynamicsConfig, stored.card.get("config"))
+    if not set(config.joints) <= {0, *network.config.joints}:
+        msg = f"{stored.path}: wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got "
+        msg += f"{config.joints}; train it again"
+        raise WeightsError(msg)
+    try:
+        dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
+    except WeightsError as error:
+        raise WeightsError(f"{stored.path}: doesn't fit {weights.path.name}: {error}") from error
+    dynamics = dynamics.float().to(next(network.parameters()).device)
+    return Dynamic(network, dynamics).eval().requires_grad_(False)
+
+
+def load_backbone(
+    name: str, garment: str | GarmentTemplate, *, mode: str = "none", folder: Path | None = None
+) -> Backbone:
+    """The trained backbone `name` of a garment.
+
+    Args:
+        name: `skinned`, `tailornet`, `dynamic`, `mlp`, `gcnn`, or `auto`: `dynamic` or `tailornet` where it ships, else
+            `skinned`.
+        garment: name of a garment, or a template.
+        mode: what it was trained with: `none`, `approx`, `accurate` or `hybrid`.
+        folder: where its files lie; the shipped weights if not given.
+
+    Raises:
+        GarmentError: there is no such garment.
+        WeightsError: there is no such backbone or mode, or no weights of it.
+    """
+    template = load_garment(garment) if isinstance(garment, str) else garment
+    weights = backbone_weights(name, template.name, mode=mode, folder=folder)
+    if weights is None:
+        return Skinned()
+    return with_dynamics(name, backbone_from_weights(weights, template).requires_grad_(False), weights)
+
+
+def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:
+    """The weights that `load_backbone` uses; None for `skinned`, and for `auto` if none ship. Raises as it does."""
+    kind = BackboneName.of(name, "backbone", error=WeightsError)
+    mode = SdfMode.of(mode, "mode of a backbone", error=WeightsError)
+    shipped = weights_folder(garment)
+    folder = shipped if folder is None else folder
+    nothing_ships = folder == shipped and not shipped.exists()  # in a folder that was named there must be some
+    if kind is BackboneName.SKINNED or (kind is BackboneName.AUTO and nothing_ships):
+        return None
+    if kind in (BackboneName.AUTO, BackboneName.DYNAMIC):  # `dynamic` is a tailornet, and more
+        kind = BackboneName.TAILORNET
+    return load_weights(folder / f"{kind}-{mode}", expect={"garment": garment})

@@ -48,12 +48,5 @@ class WithoutWearerCode:
 class Skinned(WithoutWearerCode):
     """No network: the template follows the skin. What every other backbone is measured against."""
 
-    def __call__(
-        self,
-        betas: Tensor,
-        pose: Tensor,
-        style: Tensor | None,
-        *,
-        wearer_code: Tensor | None = None,
-    ) -> None:
+    def __call__(self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None) -> None:
         """Predicts no displacement."""

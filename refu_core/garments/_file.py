@@ -17,8 +17,7 @@ from refu_core._npz import MAX_TEXT_BYTES, read_npz
 from refu_core.body import BUILTIN_BODIES
 from refu_core.errors import GarmentError, MeshError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
-from refu_core.garments._card import GarmentCard, card_to_json, json_to_card
-from refu_core.garments._template import GarmentTemplate, UvMap
+from refu_core.garments._template import GarmentCard, GarmentTemplate, UvMap, card_to_json, json_to_card
 from refu_core.mesh import check_faces
 from refu_core.modes import BUILTIN_GARMENTS, GARMENT_FILE
 
@@ -72,8 +71,7 @@ def load_garment(
     try:
         path = Path(garment)
     except TypeError as error:
-        msg = f"a garment is a name or the path of an .npz, got {type(garment).__name__}"
-        raise GarmentError(msg) from error
+        raise GarmentError(f"a garment is a name or the path of an .npz, got {type(garment).__name__}") from error
     return _read(path, device, dtype)
 
 
@@ -95,8 +93,7 @@ def garment_name(garment: str | os.PathLike[str]) -> str:
 def require_name(name: str) -> None:
     """Raises `GarmentError` for a name that no garment may have: topics and files are named after it."""
     if not _NAME.fullmatch(name):
-        msg = f"no garment is called {name!r}: wanted letters, digits, - and _ (--name)"
-        raise GarmentError(msg)
+        raise GarmentError(f"no garment is called {name!r}: wanted letters, digits, - and _ (--name)")
 
 
 def _read(path: Path, device: str | torch.device, dtype: torch.dtype) -> GarmentTemplate:
@@ -104,14 +101,12 @@ def _read(path: Path, device: str | torch.device, dtype: torch.dtype) -> Garment
     try:
         require_name(name)
     except GarmentError as error:
-        msg = f"{path}: a garment has its file's name; {error}"
-        raise GarmentError(msg) from error
+        raise GarmentError(f"{path}: a garment has its file's name; {error}") from error
     data = read_npz(path, keys=(*_NEEDED, *_OPTIONAL), error=GarmentError, wanted="a garment, as an .npz")
     try:
         card = _check(data)
     except (ValueError, RecursionError, MeshError) as error:
-        msg = f"{path}: not a garment: {error}"
-        raise GarmentError(msg) from error
+        raise GarmentError(f"{path}: not a garment: {error}") from error
 
     def tensor(key: str) -> torch.Tensor:
         return torch.tensor(data[key], device=device, dtype=dtype)
@@ -141,8 +136,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
     require_type(template, GarmentTemplate, "a GarmentTemplate, such as load_garment gives", error=GarmentError)
     target = Path(path)
     if target.suffix != ".npz":
-        msg = f"{target}: wanted the path of an .npz"
-        raise GarmentError(msg)
+        raise GarmentError(f"{target}: wanted the path of an .npz")
     require_name(_name_in(target))  # it becomes the garment's name when the file is read
     card = card_to_json(template.card).encode()
     if len(card) > MAX_TEXT_BYTES:
@@ -167,8 +161,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         with replacing(target) as file:
             np.savez_compressed(file, **arrays)
     except OSError as error:
-        msg = f"{target}: can't be written: {error.strerror}"
-        raise GarmentError(msg) from error
+        raise GarmentError(f"{target}: can't be written: {error.strerror}") from error
     return target
 
 
@@ -188,16 +181,13 @@ def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
     """The card of a garment's file. Raises `ValueError` or `MeshError` if file and card don't make a garment."""
     missing = [key for key in _NEEDED if key not in data]
     if missing:
-        msg = f"it has no {missing[0]}"
-        raise ValueError(msg)
+        raise ValueError(f"it has no {missing[0]}")
     text = data["card"].item()
     if not isinstance(text, (bytes, str)):
-        msg = f"card: wanted a text, got {data['card'].dtype}"
-        raise ValueError(msg)
+        raise ValueError(f"card: wanted a text, got {data['card'].dtype}")
     card = json_to_card(text)
     if str(data["body"]) not in BUILTIN_BODIES:
-        msg = f"it is cut for the body {str(data['body'])[:80]!r}: wanted {', '.join(BUILTIN_BODIES)}"
-        raise ValueError(msg)
+        raise ValueError(f"it is cut for the body {str(data['body'])[:80]!r}: wanted {', '.join(BUILTIN_BODIES)}")
     n = len(data["v_template"]) if data["v_template"].ndim else 0
     shapes = {
         "v_template": (n, 3),
@@ -207,11 +197,9 @@ def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
     }
     for key, shape in shapes.items():
         if key in data and (data[key].shape != shape or not n or not np.isfinite(data[key]).all()):
-            msg = f"{key}: wanted finite numbers of the shape {shape}, got {data[key].shape}"
-            raise ValueError(msg)
+            raise ValueError(f"{key}: wanted finite numbers of the shape {shape}, got {data[key].shape}")
     if not (data["weights"] >= 0).all() or np.abs(data["weights"].sum(1) - 1).max() > 1e-3:
-        msg = "weights: wanted shares of joints, rows that sum to 1"
-        raise ValueError(msg)
+        raise ValueError("weights: wanted shares of joints, rows that sum to 1")
     faces = check_faces(data["f"], n_vertices=n)
     _check_uv(data, len(faces))
     return card
@@ -219,8 +207,7 @@ def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
 
 def _check_uv(data: dict[str, NDArray[Any]], n_faces: int) -> None:
     if ("uv" in data) != ("uv_f" in data):
-        msg = "it has one of uv and uv_f, wanted both or none"
-        raise ValueError(msg)
+        raise ValueError("it has one of uv and uv_f, wanted both or none")
     if "uv" not in data:
         return
     uv, corners = data["uv"], data["uv_f"]

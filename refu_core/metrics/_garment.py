@@ -11,8 +11,7 @@ from scipy import sparse
 
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, check_faces
-from refu_core.metrics._collisions import Collisions
-from refu_core.metrics._intersect import as_vertices
+from refu_core.metrics._collisions import Collisions, as_vertices
 
 ON_SKIN = 1e-6
 """Vertices no deeper than this [m] lie on the skin, not inside: positions of a metre are stored to a tenth of this."""

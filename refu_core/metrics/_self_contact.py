@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from refu_core.body import Surface
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, vertex_normals
-from refu_core.metrics._intersect import SheetChecker, as_vertices
+from refu_core.metrics._collisions import SheetChecker, as_vertices
 from refu_core.sdf import Winding
 
 DEFAULT_NEAR = 0.02

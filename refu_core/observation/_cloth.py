@@ -1,29 +1,179 @@
-"""One garment that follows measured points."""
+"""One garment that follows measured points: the fields that may displace it, and what is believed of them."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
+from scipy.linalg.lapack import dpotri
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
+from scipy.sparse.linalg import splu
 
+from refu_core._cache import keep, recall
 from refu_core._warp import as_warp, ints
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_normals
-from refu_core.observation._estimate import Estimate
 from refu_core.observation._match_kernels import match_kernel
-from refu_core.observation._modes import smooth_modes
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from refu_core.garments import GarmentTemplate
-    from refu_core.observation._settings import ObservationSettings
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationSettings:
+    """How far points may move a garment, and how long that is remembered.
+
+    Tuned on half of the style-shape pairs of the evaluation bags; `benchmarks/outputs.py` measures on the other half.
+    """
+
+    modes: int = 192
+    """Most smooth fields that make up the displacement along the normal."""
+    finest: float = 55.0
+    """Their largest wave number [rad/m]: waves of 11 cm. A small garment has fewer fields."""
+    amplitude: float = 0.009
+    """Standard deviation of that displacement [m]: the networks' errors along the normal."""
+    wave: float = 30.0
+    """Wave number up to which fields are about as large as the widest [rad/m]: waves of 20 cm. Beyond, their size falls
+    with its square."""
+    bound: float = 3.0
+    """Each number stays within this many of its standard deviations, whatever is measured."""
+    noise: float = 0.003
+    """Standard deviation of a cell's point along the normal, and of what the fields can't follow [m]."""
+    enough: float = 2.0
+    """A cell of space with this many points counts half as much as one with very many: what the fields can't follow is
+    alike in neighbouring points, so more of them don't average it out."""
+    cell: float = 0.035
+    """Edge of a cell, whose points are replaced by their mean [m]."""
+    reach: float = 0.04
+    """Points farther from the cloth than this aren't matched to it [m]."""
+    slack: float = 0.01
+    """A point may be this much nearer to the skin than to the cloth and still be the cloth's [m]."""
+    robust: float = 0.015
+    """Height off the cloth above which a point counts less and less [m] (Cauchy)."""
+    first_rounds: int = 2
+    """How often the first points are matched; later ones once, since the last ones brought the cloth near."""
+    most_points: int = 6000
+    """More points than this are thinned out evenly."""
+    remembered: float = 0.5
+    """Time after which a displacement has faded to a third [s]: folds change with the pose."""
+    step: float = 1 / 30
+    """Time between frames that have no stamps [s]."""
+
+
+DEFAULT_OBSERVATION = ObservationSettings()
+
+
+_VERSION = 1
+_SPARE = 24
+"""Fields computed beyond those that are wanted: the last ones of a subspace are never accurate."""
+_ITERATIONS = 2
+_LOWEST = 1e-3
+"""Added to the Laplacian, so that it can be inverted."""
+
+
+def smooth_modes(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The lowest modes of a garment's Laplacian, approximately: computed in seconds once, and then cached.
+
+    Fields (V, K) are orthogonal, the smoothest first, and have a mean square of one over the vertices; their wave
+    numbers [rad/m], (K,), come with them.
+    """
+    digest = hashlib.sha256(garment.mesh.faces.tobytes()).hexdigest()[:16]
+    name = f"modes-{_VERSION}-{digest}-{garment.n_vertices}-{count}"
+    known = recall(name, keys=("fields", "value"))
+    if known is None:
+        fields, value = _subspace(garment, count)
+        known = {"fields": fields.astype(np.float32), "value": value}
+        keep(name, known)
+    rest = garment.v_template.detach().cpu().double().numpy()
+    a, b = rest[garment.mesh.edges].transpose(1, 0, 2)
+    square = float(np.median(((a - b) ** 2).sum(1)))
+    # For a mesh of even triangles, six around a vertex, the graph's Laplacian is 3/2 edge² times the surface's.
+    return known["fields"], np.sqrt(np.maximum(known["value"], 0) / (1.5 * square))
+
+
+def _subspace(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Subspace iteration with the inverse: a random block is smoothed until smooth fields are left."""
+    adjacent = garment.mesh.adjacency_matrix()
+    n = garment.n_vertices
+    laplacian = csc_array(diags_array(adjacent.sum(axis=1)) - adjacent)
+    solve = splu((laplacian + _LOWEST * eye_array(n)).tocsc()).solve
+    block = np.random.default_rng(0).normal(size=(n, min(count + _SPARE, n)))
+    for _ in range(_ITERATIONS):
+        block, _ = np.linalg.qr(solve(solve(block)))
+    value, turn = eigh(block.T @ (laplacian @ block))
+    return np.sqrt(n) * (block @ turn)[:, :count], value[:count]
+
+
+_AT_ONCE = 1e-9
+"""Time counts only once at least this share of the prior's variance comes back in it."""
+
+
+class Estimate:
+    """A mean and a precision of D numbers that return to zero by themselves (an Ornstein–Uhlenbeck process).
+
+    Numbers are in standard deviations of the prior, whose precision is therefore the identity. Between frames each
+    number fades towards zero, and its variance grows towards the prior's. So information is forgotten, yet nothing can
+    drift: without measurements the prediction is left as it was, and with them every number stays within its bound.
+    """
+
+    def __init__(self, times: F64, bound: float) -> None:
+        """For the times in which numbers fade to a third [s], (D,), and the bound of all numbers."""
+        self._times, self._limit = times, bound
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets everything."""
+        self.mean = np.zeros_like(self._times)
+        self.precision = np.eye(len(self._times))
+        """The inverse of the covariance, shape (D, D)."""
+        self.is_informed = False
+        """Whether anything was measured since the last reset."""
+
+    def wait(self, seconds: float) -> None:
+        """Lets time pass."""
+        keeps = np.exp(-seconds / self._times)
+        comes = 1 - keeps**2
+        if not self.is_informed or comes.min() < _AT_ONCE:
+            return
+        self.mean = keeps * self.mean
+        # The covariance becomes K C K + Q. Its inverse is Q⁻¹ - Q⁻¹ K (C⁻¹ + K Q⁻¹ K)⁻¹ K Q⁻¹ (Woodbury).
+        rows = np.arange(len(keeps))
+        between = self.precision
+        between[rows, rows] += keeps**2 / comes
+        ratio = keeps / comes
+        self.precision = _inverse(between) * -ratio[:, None] * ratio
+        self.precision[rows, rows] += 1 / comes
+
+    def updated(self, information: F64, pull: F64) -> tuple[F64, F64]:
+        """Mean (D,) and precision (D, D) after measurements of `information` JᵀWJ and `pull` JᵀW(r + J c)."""
+        total = self.precision + information
+        mean = cho_solve(cho_factor(total, check_finite=False), self.precision @ self.mean + pull, check_finite=False)
+        return np.clip(mean, -self._limit, self._limit), total
+
+    def take(self, mean: F64, precision: F64) -> None:
+        """Takes over a mean (D,) and a precision (D, D)."""
+        self.mean, self.precision, self.is_informed = mean, precision, True
+
+
+def _inverse(matrix: F64) -> F64:
+    """Symmetric inverse of a symmetric positive definite matrix (D, D), by half the work of `inv`; overwrites it."""
+    factor, _ = cho_factor(matrix.T, lower=True, overwrite_a=True, check_finite=False)
+    found, failed = dpotri(factor, lower=True, overwrite_c=True)
+    if failed:
+        raise LinAlgError(f"row {failed} of the factor is zero")
+    half = np.tril(found)
+    half += np.tril(half, -1).T
+    return np.asarray(half)
+
+
 _OFF_CENTRE = 0.37
 """Offset of the grid [cells]: if the body's plane of symmetry were a border, the last bit would choose the cell."""
 

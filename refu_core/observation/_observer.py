@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 import warp as wp
@@ -13,11 +11,15 @@ from refu_core._warp import as_warp, ints
 from refu_core.body import blend_transforms
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import SmplFrame
-from refu_core.observation._cloth import Measured, ObservedCloth, averaged, within
-from refu_core.observation._settings import DEFAULT_OBSERVATION, ObservationSettings
-
-if TYPE_CHECKING:
-    from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn
+from refu_core.observation._cloth import (
+    DEFAULT_OBSERVATION,
+    Measured,
+    ObservationSettings,
+    ObservedCloth,
+    averaged,
+    within,
+)
+from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn
 
 _LONGEST_GAP = 10.0
 """A person who wasn't seen for this long is a new one [s]."""
@@ -172,8 +174,7 @@ def _finite(name: str, value: ArrayLike, ndim: int) -> NDArray[np.float64]:
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        msg = f"{name} must be numbers of the shape {wanted}, got {type(value).__name__}"
-        raise FrameError(msg) from error
+        raise FrameError(f"{name} must be numbers of the shape {wanted}, got {type(value).__name__}") from error
     if array.ndim != ndim or array.shape[-1] != 3 or not np.isfinite(array).all():
         msg = f"{name} must be finite numbers of the shape {wanted}, got {array.shape}; leave out what isn't measured"
         raise FrameError(msg)

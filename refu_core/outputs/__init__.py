@@ -7,7 +7,6 @@ from refu_core.outputs._dressed import Fittings as Fittings
 from refu_core.outputs._limbs import PRESSED as PRESSED
 from refu_core.outputs._limbs import LimbContact as LimbContact
 from refu_core.outputs._limbs import LimbContacts as LimbContacts
-from refu_core.outputs._normals import VertexNormals as VertexNormals
 from refu_core.outputs._openings import Opening as Opening
 from refu_core.outputs._openings import Openings as Openings
 from refu_core.outputs._planner import HALF_THICKNESS as HALF_THICKNESS

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core.body import SmplBody
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import as_points
 from refu_core.outputs._worn import require_known, require_worn
+from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.sdf import BandSdf
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
-    from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 REACH = 0.02
 """Clearance is exact up to this [m]: a hand's thickness, and beyond it cloth hangs free."""

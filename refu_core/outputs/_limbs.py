@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from refu_core._warp import as_warp, ints, memory
-from refu_core.body import DEFAULT_GAP, SEGMENTS, part_of_faces
+from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody, part_of_faces
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
 from refu_core.outputs._worn import require_worn
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
-    from refu_core.realtime import GarmentPipeline, PipelineOutput
+from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 PRESSED = DEFAULT_GAP + 0.003
 """Cloth is pressed if its distances to the skins on both sides add up to less than this [m]: the room that the collider
@@ -89,11 +84,8 @@ class LimbContacts:
         for mesh in self._meshes:
             mesh.refit()
         wp.launch(kernels.box_kernel, len(_PARTS), [self._parts], device="cpu")
-        found: list[tuple[NDArray[np.int32], NDArray[np.float64]]] = []
-        for name, garment in output.items():
-            found.append(self._pressed(garment.local, self._faces[name]))
-        pairs = np.concatenate([pair for pair, _ in found])
-        rows = np.concatenate([row for _, row in found])
+        found = [self._pressed(garment.local, self._faces[name]) for name, garment in output.items()]
+        pairs, rows = map(np.concatenate, zip(*found, strict=True))
         contacts = [_contact(int(pair), rows[pairs == pair]) for pair in np.unique(pairs)]
         return tuple(sorted(contacts, key=lambda contact: -contact.area))
 
@@ -103,19 +95,10 @@ class LimbContacts:
         """For the vertices that are pressed: the pair of parts, (M,), and area, depth and place, (M, 5)."""
         n = len(points)
         pair, depth = np.empty(n, np.int32), np.empty(n, np.float32)
-        wp.launch(
-            kernels.pressed_kernel,
-            n,
-            [wp.array(points, dtype=wp.vec3, device="cpu", copy=False), self._parts, PRESSED, _OPPOSED],
-            [
-                wp.array(pair, dtype=wp.int32, device="cpu", copy=False),
-                wp.array(depth, dtype=wp.float32, device="cpu", copy=False),
-            ],
-            device="cpu",
-        )
+        kinds = ((points, wp.vec3), (pair, wp.int32), (depth, wp.float32))
+        asked, *outputs = (wp.array(one, dtype=kind, device="cpu", copy=False) for one, kind in kinds)
+        wp.launch(kernels.pressed_kernel, n, [asked, self._parts, PRESSED, _OPPOSED], outputs, device="cpu")
         rows = np.flatnonzero(pair >= 0)
-        if not len(rows):
-            return pair[rows], np.empty((0, 5))
         area = vertex_areas(points, faces[(pair[faces] >= 0).any(axis=1)])
         return pair[rows], np.column_stack((area[rows], depth[rows], points[rows]))
 
@@ -125,9 +108,5 @@ def _contact(pair: int, rows: NDArray[np.float64]) -> LimbContact:
     share = area / max(float(area.sum()), 1e-12)
     first, second = divmod(pair, len(_PARTS))
     return LimbContact(
-        (_PARTS[first], _PARTS[second]),
-        float(area.sum()),
-        float(depth.max()),
-        float(share @ depth),
-        share @ places,
+        (_PARTS[first], _PARTS[second]), float(area.sum()), float(depth.max()), float(share @ depth), share @ places
     )

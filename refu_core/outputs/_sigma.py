@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,19 +15,14 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from refu_core.backbones import SEEN_TILT
+from refu_core.body import SmplBody
 from refu_core.errors import FrameError, MeshError, WeightsError
-from refu_core.frames import N_JOINTS
+from refu_core.frames import N_JOINTS, SmplFrame
+from refu_core.garments import GarmentTemplate
 from refu_core.outputs._worn import require_worn
+from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.skeleton import CARRIED
 from refu_core.weights import load_weights, save_weights, weights_folder
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from refu_core.body import SmplBody
-    from refu_core.frames import SmplFrame
-    from refu_core.garments import GarmentTemplate
-    from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 UNKNOWN_SIGMA = 0.03
 """σ of every vertex of a garment whose network has no `sigma` file, or that has no network and follows the skin [m].
@@ -37,7 +33,6 @@ REGIONS = 3
 """Number of pose regions: equal shares of the samples, from hardly bent to most bent."""
 _SWEEPS = 10
 """How often errors are averaged with those of neighbours: some fifty samples say too little about a single vertex."""
-_FILE = "sigma"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +76,13 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     (N, 24, 3). In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` σ.
     Raises `MeshError` for arrays of other shapes, and for fewer than 10 samples a region.
     """
-    length = np.asarray(errors, np.float64)
-    where = np.asarray(poses, np.float64)
+    length, where = np.asarray(errors, np.float64), np.asarray(poses, np.float64)
     n = len(length)
     if length.shape != (n, garment.n_vertices) or where.shape != (n, N_JOINTS, 3) or not np.isfinite(length).all():
         wanted = f"finite errors (N, {garment.n_vertices}) and poses (N, {N_JOINTS}, 3)"
-        msg = f"wanted {wanted}, got {length.shape} and {where.shape}"
-        raise MeshError(msg)
+        raise MeshError(f"wanted {wanted}, got {length.shape} and {where.shape}")
     if n < 10 * REGIONS:
-        msg = f"σ needs {10 * REGIONS} samples or more, got {n}"
-        raise MeshError(msg)
+        raise MeshError(f"σ needs {10 * REGIONS} samples or more, got {n}")
     around = garment.mesh.adjacency_matrix()
     degree = np.maximum(around.sum(axis=1), 1.0)
     variance = (length**2).mean(0) / 3
@@ -98,10 +90,9 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
         variance = 0.5 * variance + 0.5 * (around @ variance) / degree
     sigma = np.sqrt(variance)
     bend = bend_of(garment, where)
-    middle, factor = [], []
-    for rows in np.array_split(np.argsort(bend, kind="stable"), REGIONS):
-        middle.append(np.median(bend[rows]))
-        factor.append(np.quantile(length[rows] / sigma, 0.9) / RADIUS_90)
+    regions = np.array_split(np.argsort(bend, kind="stable"), REGIONS)
+    middle = [np.median(bend[rows]) for rows in regions]
+    factor = [np.quantile(length[rows] / sigma, 0.9) / RADIUS_90 for rows in regions]
     return SigmaMap(sigma.astype(np.float32), np.array(middle, np.float32), np.array(factor, np.float32))
 
 
@@ -112,13 +103,10 @@ def save_sigma(
 
     Raises `WeightsError` where it can't be written.
     """
-    tensors = {
-        "sigma": torch.from_numpy(found.sigma).half(),
-        "bend": torch.from_numpy(found.bend),
-        "factor": torch.from_numpy(found.factor),
-    }
+    tensors = {name: torch.from_numpy(getattr(found, name)) for name in ("sigma", "bend", "factor")}
+    tensors["sigma"] = tensors["sigma"].half()
     about = {"garment": garment.name, "n_vertices": garment.n_vertices, **card}
-    return save_weights(weights_folder(garment.name, folder) / _FILE, tensors, about)
+    return save_weights(weights_folder(garment.name, folder) / "sigma", tensors, about)
 
 
 def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | None = None) -> SigmaMap:
@@ -126,19 +114,17 @@ def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | Non
 
     Raises `WeightsError` for a file that is damaged, or of another garment.
     """
-    stem = weights_folder(garment.name, folder) / _FILE
+    stem = weights_folder(garment.name, folder) / "sigma"
     if not stem.with_suffix(".json").exists():
         return SigmaMap.unknown(garment.n_vertices)
     stored = load_weights(stem, expect={"garment": garment.name, "n_vertices": garment.n_vertices})
     try:
         sigma, bend, factor = (stored.tensors[key].float().numpy() for key in ("sigma", "bend", "factor"))
     except KeyError as error:
-        msg = f"{stored.path}: wanted the tensors sigma, bend and factor, there is no {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{stored.path}: wanted the tensors sigma, bend and factor, there is no {error}") from error
     is_right = sigma.shape == (garment.n_vertices,) and bend.ndim == 1 and bend.shape == factor.shape and len(bend)
     if not is_right or not ((sigma > 0).all() and (factor > 0).all() and (np.diff(bend) >= 0).all()):
-        msg = f"{stored.path}: not the σ of {garment.name}: make it anew with scripts/fit_sigma.py"
-        raise WeightsError(msg)
+        raise WeightsError(f"{stored.path}: not the σ of {garment.name}: make it anew with scripts/fit_sigma.py")
     return SigmaMap(sigma, bend, factor)
 
 
@@ -150,8 +136,7 @@ class Sigma:
 
         Raises `WeightsError` for a damaged file of σ.
         """
-        self._body = pipeline.body
-        self._garments = pipeline.garments
+        self._body, self._garments = pipeline.body, pipeline.garments
         self.maps: dict[str, SigmaMap] = {}
         """By garment. One that no network drapes, or whose network wasn't measured, has `UNKNOWN_SIGMA`."""
         for name, garment in self._garments.items():
@@ -218,11 +203,9 @@ def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.f
         array = np.full(0, np.nan)
     if array.shape not in shapes or not np.isfinite(array).all():
         wanted, got = " or ".join(map(str, shapes)), array.shape if array.size else type(value).__name__
-        msg = f"{name} must be finite numbers of the shape {wanted}, got {got}"
-        raise FrameError(msg)
+        raise FrameError(f"{name} must be finite numbers of the shape {wanted}, got {got}")
     if (np.diagonal(array, axis1=-2, axis2=-1) < 0).any():
-        msg = f"{name} has a negative variance on its diagonal"
-        raise FrameError(msg)
+        raise FrameError(f"{name} has a negative variance on its diagonal")
     if np.abs(array).max() > _LARGEST:
         msg = f"{name}: wanted numbers up to {_LARGEST:g}, got {np.abs(array).max():g}: leave out what isn't known"
         raise FrameError(msg)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, vertex_areas
 
 _EVEN = 0.03
 """An edge costs as much as missing a triangle's plane by this share of the edge's length. Cloth folds elsewhere in each
@@ -166,7 +166,6 @@ def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[NDArra
     third = double / 6
     for corner in range(3):
         np.add.at(forms, mesh.faces[:, corner], third[:, None, None] * plane[:, :, None] * plane[:, None])
-    areas = np.bincount(mesh.faces.ravel(), weights=np.repeat(third, 3), minlength=len(vertices))
     for corner in range(3):
         rim = mesh.n_faces_of_edge[mesh.edge_of_corner[:, corner]] == 1
         start, end = mesh.faces[rim, corner], mesh.faces[rim, (corner + 1) % 3]
@@ -179,4 +178,4 @@ def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[NDArra
         np.add.at(forms, start, form)
         np.add.at(forms, end, form)
     upper = forms[:, [0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3]]
-    return upper, areas.astype(np.float64)
+    return upper, vertex_areas(vertices, mesh.faces)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -52,15 +52,9 @@ class PinholeCamera:
         rotation = np.asarray(self.rotation, dtype=np.float64)
         translation = np.asarray(self.translation, dtype=np.float64)
         numbers = [*self.focal, *self.centre, *rotation.ravel(), *translation.ravel()]
-        if not (
-            self.width > 0
-            and self.height > 0
-            and min(self.focal) > 0
-            and rotation.shape == (3, 3)
-            and translation.shape == (3,)
-            and np.isfinite(numbers).all()
-            and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
-        ):
+        is_sized = min(self.width, self.height, *self.focal) > 0 and bool(np.isfinite(numbers).all())
+        is_shaped = (rotation.shape, translation.shape) == ((3, 3), (3,))
+        if not (is_sized and is_shaped) or np.abs(rotation @ rotation.T - np.eye(3)).max() >= 1e-3:
             msg = (
                 "a camera has a size in pixels, positive focal lengths, a rotation (3, 3) and a translation (3,), got "
                 f"{self.width} x {self.height}, {self.focal}, {rotation.tolist()}, {translation.tolist()}"
@@ -83,8 +77,7 @@ class PinholeCamera:
         """
         target, eye = (checked_numbers(name, at, (3,), np.float64) for name, at in (("target", target), ("eye", eye)))
         if not 0 < fov < math.pi or not width > 0:
-            msg = f"wanted a positive width and an angle below 180 degrees, got {width} pixels and {fov} rad"
-            raise MeshError(msg)
+            raise MeshError(f"wanted a positive width and an angle below 180 degrees, got {width} pixels and {fov} rad")
         away = target - eye
         right = np.cross(away, [0.0, 1.0, 0.0])
         if not np.linalg.norm(right) > 1e-6 * np.linalg.norm(away):
@@ -104,13 +97,8 @@ class PinholeCamera:
     def scaled(self, width: int) -> PinholeCamera:
         """The same view with another number of columns, and rows in proportion."""
         factor = width / self.width
-        return replace(
-            self,
-            width=width,
-            height=max(round(self.height * factor), 1),
-            focal=(self.focal[0] * factor, self.focal[1] * factor),
-            centre=(self.centre[0] * factor, self.centre[1] * factor),
-        )
+        focal, centre = ((x * factor, y * factor) for x, y in (self.focal, self.centre))
+        return replace(self, width=width, height=max(round(self.height * factor), 1), focal=focal, centre=centre)
 
 
 def visible(
@@ -136,16 +124,12 @@ def all_visible(
     """`visible` for several meshes that hide each other, at the cost of one. Raises `MeshError` as `visible` does."""
     if not meshes:
         return []
-    drawn = _draw(meshes, camera.scaled(min(camera.width, buffer_width)))
-    seen = np.zeros(len(drawn.seen), np.bool_)
-    wp.launch(
-        kernels.visible_kernel,
-        len(seen),
-        [drawn.seen, drawn.faces, NEAR, TOLERANCE, drawn.buffer],
-        [wp.array(seen, dtype=wp.bool, device="cpu", copy=False)],
-        device="cpu",
-    )
-    return np.split(seen, drawn.ends[:-1])
+    points, faces, buffer, ends = _draw(meshes, camera.scaled(min(camera.width, buffer_width)))
+    seen = np.zeros(len(points), np.bool_)
+    output = wp.array(seen, dtype=wp.bool, device="cpu", copy=False)
+    inputs = [points, faces, NEAR, TOLERANCE, buffer]
+    wp.launch(kernels.visible_kernel, len(seen), inputs, [output], device="cpu")
+    return np.split(seen, ends[:-1])
 
 
 def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.float32]:
@@ -155,18 +139,12 @@ def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.flo
     """
     if not meshes:
         return np.full((camera.height, camera.width), np.inf, np.float32)
-    found = _draw(meshes, camera).buffer.numpy()
+    found = _draw(meshes, camera)[2].numpy()
     return np.where(found == np.iinfo(np.int64).max, np.inf, (found >> 32) * 1e-6).astype(np.float32)
 
 
-class _Drawn(NamedTuple):
-    seen: Any
-    faces: Any
-    buffer: Any
-    ends: NDArray[np.int64]
-
-
-def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
+def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> tuple[Any, Any, Any, NDArray[np.int64]]:
+    """What kernels take: vertices as the camera sees them, faces, depth buffer; and where each mesh's vertices end."""
     points = [as_points("vertices", vertices) for vertices, _ in meshes]
     checked = [check_faces(faces, n_vertices=len(own)) for own, (_, faces) in zip(points, meshes, strict=True)]
     ends = np.cumsum([len(own) for own in points])
@@ -181,4 +159,4 @@ def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> _Drawn:
     seen = wp.array(there.astype(np.float32), dtype=wp.vec3, device="cpu", copy=False)
     buffer = wp.full((camera.height, camera.width), np.iinfo(np.int64).max, dtype=wp.int64, device="cpu")
     wp.launch(kernels.raster_kernel, len(corners), [seen, faces, NEAR], [buffer], device="cpu")
-    return _Drawn(seen, faces, buffer, ends)
+    return seen, faces, buffer, ends

@@ -18,5 +18,4 @@ def require_worn(output: object, known: Collection[str]) -> None:
 def require_known(name: str, known: Collection[str]) -> None:
     """Raises `MeshError` for a garment that isn't `known`."""
     if name not in known:
-        msg = f"no garment {name!r} here: wanted one of {', '.join(known)}"
-        raise MeshError(msg)
+        raise MeshError(f"no garment {name!r} here: wanted one of {', '.join(known)}")

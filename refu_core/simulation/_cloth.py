@@ -7,17 +7,76 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 
-from refu_core.mesh import vertex_areas
+from refu_core.errors import MeshError
+from refu_core.mesh import Connectivity, linked, vertex_areas
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._mesh import ClothTopology
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class ClothTopology:
+    """The pairs of vertices that the constraints on a garment of N vertices connect."""
+
+    mesh: Connectivity
+    edges: NDArray[np.int32]
+    """Edges of the mesh sorted by colour, shape (E, 2): edges of one colour share no vertex, which keeps a processor's
+    pipeline full."""
+    bends: NDArray[np.int32]
+    """The two vertices opposite each inner edge, also sorted by colour, shape (B, 2)."""
+
+    @staticmethod
+    def of(mesh: Connectivity) -> ClothTopology:
+        """The topology of a garment. Raises `MeshError` when an edge has more than two faces."""
+        opposite = mesh.faces[:, [2, 0, 1]].reshape(-1)
+        count = mesh.n_faces_of_edge
+        if count.max(initial=0) > 2:
+            raise MeshError(f"a garment's edges need one or two faces, got {count.max()} on one edge: clean the mesh")
+        by_edge = opposite[np.argsort(mesh.edge_of_corner.ravel(), kind="stable")]
+        first = np.concatenate(([0], np.cumsum(count)))[:-1]
+        inner = count == 2
+        bends = np.stack((by_edge[first[inner]], by_edge[first[inner] + 1]), 1)
+        return ClothTopology(mesh, _by_colour(mesh.edges), _by_colour(bends))
+
+    def boundary_loops(self) -> list[NDArray[np.intp]]:
+        """Vertices of each hem (waist, cuff, neckline), each sorted by index, in the order of their lowest index."""
+        rim, n = self.mesh.boundary, self.mesh.n_vertices
+        _, label = linked(rim, n)
+        on_rim = np.zeros(n, bool)
+        on_rim[rim] = True
+        return [np.flatnonzero((label == k) & on_rim) for k in dict.fromkeys(label[on_rim])]
+
+    def distance_from(self, vertices: NDArray[Any], sources: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Shortest path along the edges from any of `sources` to each of `vertices` (N, 3) [m], shape (N,)."""
+        i, j = self.mesh.edges.T
+        length = np.linalg.norm(vertices[i] - vertices[j], axis=1) + 1e-9
+        graph = coo_array((length, (i, j)), shape=(len(vertices),) * 2).tocsr()
+        return np.asarray(dijkstra(graph, directed=False, indices=sources, min_only=True))
+
+
+def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The pairs sorted by a greedy colouring: pairs of one colour share no vertex."""
+    taken: dict[int, int] = {}  # bit mask of the colours around a vertex
+    colour = np.empty(len(pairs), np.int64)
+    for k, (i, j) in enumerate(pairs.tolist()):
+        free = ~(taken.get(i, 0) | taken.get(j, 0))
+        bit = free & -free
+        taken[i] = taken.get(i, 0) | bit
+        taken[j] = taken.get(j, 0) | bit
+        colour[k] = bit.bit_length()
+    found: NDArray[np.int32] = pairs[np.argsort(colour, kind="stable")]
+    return found
+
+
 _Contacts = tuple[I32, F32, F32, F32]
 """Vertices, or both ends of edges; and for each the place on the skin, its normal and its motion in a substep."""
 
@@ -106,7 +165,7 @@ class SimulatedCloth:
         self.topology = topology
         self._sdf = sdf
         self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
-        n = topology.n_vertices
+        n = topology.mesh.n_vertices
         # Bends first: in each sweep the stiffer edges have the last word.
         ends = np.concatenate((topology.bends, topology.edges))
         self._ends = ends.astype(np.uint32)  # unsigned: no check for indices that count from the end
@@ -137,7 +196,7 @@ class SimulatedCloth:
         `waist` vertices are held at the place on the skin that is closest to them in the rest pose: the body at rest is
         `body_rest` (V, 3).
         """
-        n, n_edges = self.topology.n_vertices, len(self.topology.mesh.edges)
+        n, n_edges = len(rest), len(self.topology.mesh.edges)
         self._told_apart: F32 = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
         self._skin, self._middles = _Skin(n), _Skin(n_edges)
         self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: the first call searches
@@ -216,7 +275,7 @@ class SimulatedCloth:
 
     def _pairs(self) -> tuple[I32, I32, F32]:
         """Vertices near a face that they aren't near in the rest shape, the face, and the vertex's side of it."""
-        from refu_core.simulation._pairs import find_candidates, near_pairs
+        from refu_core.simulation._solver import find_candidates, near_pairs
 
         faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
         if float(np.sqrt(_squared_way(self.positions, self._searched_at).max())) > _PAIR_SLACK / 2:

@@ -12,11 +12,20 @@ from numpy.typing import NDArray
 from refu_core.errors import SimulationError
 from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
 from refu_core.simulation._joined import slices_of
-from refu_core.simulation._motion import FPS
 from refu_core.simulation._plan import TEST
-from refu_core.simulation._postures import POSTURES
-from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, FORMAT, QUANTUM, SEQUENCES, Rows, dequantise, read_card, read_unseen
+from refu_core.simulation._poses import POSTURES
+from refu_core.simulation._store import (
+    CAUSES,
+    DONE,
+    FORMAT,
+    FPS,
+    QUANTUM,
+    SEQUENCES,
+    Rows,
+    dequantise,
+    read_card,
+    read_unseen,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +101,7 @@ class GarmentSequence:
 
 
 class _Finished:
-    """The finished rows of a set, in the order of their slots, memory-mapped and read-only.
-
-    A set that is still being written can be read: it has the rows that were finished when it was opened.
-    """
+    """The finished rows of a set, in the order of their slots, memory-mapped and read-only."""
 
     def __init__(self, path: str | Path, kind: str, *, first_clip: int) -> None:
         self._path = Path(path)
@@ -108,9 +114,8 @@ class _Finished:
         self._clips = self._clip_names()
         self._check("split", 0, 2)
         self.test: NDArray[np.bool_] = self.column("split") == TEST
-        """Which rows are kept for the test, shape (M,)."""
         self.train: NDArray[np.bool_] = ~self.test
-        """Which rows are for training, shape (M,)."""
+        """Which rows are for training, shape (M,); the others, `test`, are kept for the test."""
         self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])))
         if self.card.get("quantum_m") != QUANTUM:
             msg = f"{path}: wanted positions in units of {QUANTUM} m, got {str(self.card.get('quantum_m'))[:80]}"
@@ -169,16 +174,14 @@ class _Finished:
         Raises `SimulationError` for a name that is no column.
         """
         if name not in self._columns:
-            msg = f"wanted one of the columns {', '.join(sorted(self._columns))}, got {name!r}"
-            raise SimulationError(msg)
+            raise SimulationError(f"wanted one of the columns {', '.join(sorted(self._columns))}, got {name!r}")
         found: NDArray[Any] = self._columns[name][self._rows]
         return found
 
     def _row(self, index: int) -> tuple[dict[str, Any], str]:
         """The columns of one row, and its split. Raises `SimulationError` when there is no such row."""
         if not -len(self) <= index < len(self):
-            msg = f"the set has {len(self)} finished rows, there is none of the index {index}"
-            raise SimulationError(msg)
+            raise SimulationError(f"the set has {len(self)} finished rows, there is none of the index {index}")
         row = {name: values[self._rows[index]] for name, values in self._columns.items()}
         return row, "test" if row["split"] == TEST else "train"
 
@@ -207,11 +210,10 @@ class GarmentDataset(_Finished):
         """
         row, split = self._row(index)
         clip, frame = int(row["clip"]), int(row["frame"])
+        copied: dict[str, Any] = {name: np.array(row[name]) for name in ("pose", "betas", "style")}
         return GarmentSample(
             vertices=dequantise(row["vertices"]),
-            pose=np.array(row["pose"]),
-            betas=np.array(row["betas"]),
-            style=np.array(row["style"]),
+            **copied,
             slot=int(row["slot"]),
             pair=int(row["pair"]),
             split=split,
@@ -231,18 +233,13 @@ class GarmentSequences(_Finished):
         self._check("cause", 0, len(CAUSES) + 1)
 
     def sequence(self, index: int) -> GarmentSequence:
-        """The sequence of this index, -S to S - 1.
-
-        Raises `SimulationError` when there is no such sequence.
-        """
+        """The sequence of this index, -S to S - 1. Raises `SimulationError` when there is no such sequence."""
         row, split = self._row(index)
+        copied: dict[str, Any] = {name: np.array(row[name]) for name in ("pose", "transl", "betas", "style")}
         return GarmentSequence(
             kept=np.asarray(row["cause"] == 0),
             cause=[None if cause == 0 else CAUSES[cause - 1] for cause in row["cause"]],
-            pose=np.array(row["pose"]),
-            transl=np.array(row["transl"]),
-            betas=np.array(row["betas"]),
-            style=np.array(row["style"]),
+            **copied,
             fps=float(FPS),
             number=int(row["slot"]),
             shape=int(row["shape"]),

@@ -13,17 +13,73 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from refu_core.body import DEFAULT_GAP, Collider, SmplBody
 from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
+from refu_core.mesh import Connectivity
+from refu_core.metrics import SheetChecker
 from refu_core.realtime._turn import RootTurn
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._cloth import F32, ClothSettings, SimulatedCloth
+from refu_core.simulation._cloth import F32, ClothSettings, ClothTopology, SimulatedCloth
 from refu_core.simulation._joined import JoinedGarments
-from refu_core.simulation._mesh import ClothTopology
-from refu_core.simulation._untangle import Untangle
+from refu_core.skeleton import posed
+
+_ROUNDS = 8
+"""Most rounds. Nearly all that can be resolved takes one to three, each over a wider part of the cloth."""
+_RINGS = 2
+"""Rings of neighbours around intersecting faces that a round smooths with them."""
+_SWEEPS = (4, 5)
+"""Per round: pushes off the skin, and smoothing sweeps before each push."""
+
+
+class Untangle:
+    """Smooths a settled garment where its own faces intersect, as in the crook of an elbow bent by 2 rad.
+
+    There is no room there for two layers and their folds, and as only vertices are kept off faces, edges slip through
+    each other. Vertices around move towards the mean of their neighbours and are then pushed off the skin, as in ReFU.
+    """
+
+    def __init__(self, mesh: Connectivity, sdf: ExactSdf, *, margin: float) -> None:
+        """For a garment that is kept `margin` above the body behind `sdf` [m]."""
+        self._faces, self._sdf, self._margin = np.asarray(mesh.faces), sdf, margin
+        around = mesh.adjacency_matrix()
+        share = around.multiply(1 / np.maximum(around.sum(1), 1)[:, None])
+        self._mean = sparse.csr_array(share.astype(np.float32))
+        self._sheet = SheetChecker(self._faces)
+
+    def __call__(self, vertices: F32, body: F32) -> F32:
+        """Smoothed vertices (N, 3) of the garment on a body (V, 3) [m]: the very same array if no faces intersect.
+
+        Some faces may still intersect after the last round.
+        """
+        points, is_loose = vertices, np.zeros(len(vertices), np.bool_)
+        for round_ in range(_ROUNDS):
+            self._sheet.update(points)
+            pairs = self._sheet.with_itself()
+            if not len(pairs):
+                break
+            if not round_:
+                points = vertices.copy()
+                self._sdf.update(torch.from_numpy(np.ascontiguousarray(body)))
+            is_loose[self._faces[pairs]] = True
+            for _ in range(_RINGS):
+                is_loose |= self._mean @ is_loose.astype(np.float32) > 0
+            loose = np.flatnonzero(is_loose)
+            self._level(points, loose)
+        return points
+
+    def _level(self, points: F32, loose: NDArray[np.intp]) -> None:
+        mean = self._mean[loose]
+        for _ in range(_SWEEPS[0]):
+            for _ in range(_SWEEPS[1]):
+                points[loose] = (points[loose] + mean @ points) / 2
+            found = self._sdf.query(torch.from_numpy(points[loose]))
+            lack = (self._margin - found.distance).clamp_min(0)
+            points[loose] += (lack[:, None] * found.gradient).numpy()
+
 
 GRAVITY = 9.81
 """[m/s²], along -y of the world."""
@@ -58,12 +114,23 @@ class DrapeSettings:
     """Gap that is kept between two parts of the body [m]."""
 
 
-def canonical_pose() -> NDArray[np.float32]:
-    """The pose of the canonical drape: arms lowered by 50°, legs slightly apart [rad], shape (24, 3)."""
-    pose = np.zeros((N_JOINTS, 3), np.float32)
-    pose[16, 2], pose[17, 2] = -0.87, 0.87
-    pose[1, 2], pose[2, 2] = 0.08, -0.08
-    return pose
+CANONICAL_POSE = posed("both_shoulder 0 0 -0.87, both_hip 0 0 0.08").astype(np.float32)
+"""The pose of the canonical drape: arms lowered by 50°, legs slightly apart [rad], shape (24, 3)."""
+COMFORT_POSES = np.stack(
+    [
+        posed("both_shoulder 0 0 -0.87"),
+        posed("both_shoulder 0 -0.7 0, both_elbow 0 -2 0"),
+        posed("both_hip -0.8 0 0, both_knee 1.2 0 0"),
+        posed("both_hip 0 0 0.4"),
+    ]
+).astype(np.float32)
+"""Poses that a garment is cut to be comfortable in [rad], shape (P, 24, 3); the T-pose isn't among them.
+
+Cloth cut to the T-pose alone is too short over the shoulders when arms hang, at the elbows when they bend, at the seat,
+the knees and the crotch when legs are raised or spread; a tailor leaves room there.
+"""
+CROOK_POSE = posed("both_elbow 0 -2 0").astype(np.float32)
+"""Elbows bent by 2 rad [rad], shape (24, 3): where a sleeve gets shorter, its wrinkles are finer than its mesh."""
 
 
 def pose_path(start: NDArray[np.floating], end: NDArray[np.floating], n: int) -> NDArray[np.float32]:
@@ -78,29 +145,6 @@ def pose_path(start: NDArray[np.floating], end: NDArray[np.floating], n: int) ->
     path = np.stack([(first * Rotation.from_rotvec(turn * u)).as_rotvec() for u in t]).astype(np.float32)
     path[-1] = end
     return path
-
-
-def comfort_poses() -> NDArray[np.float32]:
-    """Poses that a garment is cut to be comfortable in [rad], shape (P, 24, 3); the T-pose isn't among them.
-
-    Cloth cut to the T-pose alone is too short over the shoulders when arms hang, at the elbows when they bend, at the
-    seat, the knees and the crotch when legs are raised or spread; a tailor leaves room there.
-    """
-    hang, bend, raised, spread = np.zeros((4, N_JOINTS, 3), np.float32)
-    hang[16, 2], hang[17, 2] = -0.87, 0.87
-    bend[16, 1], bend[17, 1] = -0.7, 0.7
-    bend[18, 1], bend[19, 1] = -2.0, 2.0
-    raised[1, 0] = raised[2, 0] = -0.8
-    raised[4, 0] = raised[5, 0] = 1.2
-    spread[1, 2], spread[2, 2] = 0.4, -0.4
-    return np.stack((hang, bend, raised, spread))
-
-
-def crook_pose() -> NDArray[np.float32]:
-    """Elbows bent by 2 rad [rad], shape (24, 3): where a sleeve gets shorter, its wrinkles are finer than its mesh."""
-    pose = np.zeros((N_JOINTS, 3), np.float32)
-    pose[18, 1], pose[19, 1] = -2.0, 2.0
-    return pose
 
 
 def _alone(values: NDArray[np.floating]) -> torch.Tensor:
@@ -153,12 +197,12 @@ class Draper:
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
         self._collider = Collider(body, gap=self.settings.gap)
-        self.cloth = SimulatedCloth(
-            self.topology, sdf, piece=self.outfit.number_of_vertex, settings=self.settings.cloth
-        )
+        counts = [garment.n_vertices for garment in self.outfit.garments]
+        piece = np.repeat(np.arange(len(counts)), counts)
+        self.cloth = SimulatedCloth(self.topology, sdf, piece=piece, settings=self.settings.cloth)
         self._waist = self._waists()
         self._untangle = Untangle(garment.mesh, sdf, margin=self.settings.cloth.margin)
-        self._comfort = np.concatenate((comfort_poses(), crook_pose()[None]))
+        self._comfort = np.concatenate((COMFORT_POSES, CROOK_POSE[None]))
         self._canonical: tuple[bytes, F32, F32] | None = None
 
     def _waists(self) -> NDArray[np.intp]:
@@ -200,7 +244,7 @@ class Draper:
         gravity = np.array([0, -GRAVITY, 0], np.float32)
         for _ in range(s.dress_frames):
             self.cloth.frame(body, body, gravity=gravity, drag=s.drag[0])
-        for after in self.bodies(pose_path(np.zeros((N_JOINTS, 3)), canonical_pose(), s.lower_frames), betas):
+        for after in self.bodies(pose_path(np.zeros((N_JOINTS, 3)), CANONICAL_POSE, s.lower_frames), betas):
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
             body = after
         for k in range(s.canonical_frames):
@@ -241,7 +285,7 @@ class Draper:
         target[0] = 0
         way = np.linalg.norm(self.bodies(target[None], betas)[0] - body, axis=1).max()
         n = int(np.clip(np.ceil(way / s.speed), *s.move_frames))
-        poses = pose_path(canonical_pose(), target, n)
+        poses = pose_path(CANONICAL_POSE, target, n)
         tilts = pose_path(np.zeros((1, 3)), root.as_rotvec()[None], n)
         bodies = self.bodies(poses, betas)
         self.begin(start, betas, style, bodies[-1])

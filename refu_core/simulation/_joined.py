@@ -8,7 +8,6 @@ from itertools import accumulate
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refu_core.errors import SimulationError
@@ -43,19 +42,13 @@ class JoinedGarments:
         by_name = {garment.name: garment for garment in garments}
         if not garments or len(by_name) < len(garments) or len({garment.body for garment in garments}) > 1:
             named = ", ".join(f"{garment.name} for {garment.body}" for garment in garments) or "none"
-            msg = f"wanted different garments of one body, got {named}"
-            raise SimulationError(msg)
+            raise SimulationError(f"wanted different garments of one body, got {named}")
         self.garments = tuple(by_name[name] for name in inner_first(by_name))
         """From the skin outwards."""
         self.parts = slices_of({garment.name: garment.n_vertices for garment in self.garments})
         """Which of the joined garment's vertices are each garment's."""
         self.joined = _joined(self.garments, self.parts)
         """All garments as one template; its name contains all their names, its card is the outermost garment's."""
-
-    @property
-    def number_of_vertex(self) -> NDArray[np.intp]:
-        """Number of the garment that each vertex belongs to, from the skin outwards, shape (N,)."""
-        return np.repeat(np.arange(len(self.garments)), [garment.n_vertices for garment in self.garments])
 
     def layered(self, positions: F32, body: F32, sdf: ExactSdf) -> F32:
         """`positions` (N, 3) [m] with each garment lifted off the skin until it is above the garments below it.

@@ -18,11 +18,9 @@ from scipy.special import ndtr, ndtri
 from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
-from refu_core.simulation._poses import Clip, clip_pose, random_pose
-from refu_core.simulation._postures import FIRST_POSTURES, POSTURES, drawn_posture
+from refu_core.simulation._poses import FIRST_POSTURES, POSTURES, Clip, clip_pose, drawn_posture, random_pose
 
 TRAIN, TEST = 0, 1
-MAX_PIVOTS_SHARE = 0.5
 _MOST = 10**9
 
 
@@ -80,20 +78,17 @@ class SamplePlan:
         is_whole = all(isinstance(number, int) and 0 <= number <= _MOST for number in whole)
         if not (is_named and is_whole and all(isinstance(share, Real) for share in shares)):
             wanted = f"names of garments, whole numbers from 0 to {_MOST}, and shares"
-            msg = f"a plan is made of {wanted}, got {str(asdict(self))[:400]}"
-            raise SimulationError(msg)
-        if self.count < 1 or self.pivots < 1 or self.poses_per_pair < 1 or self.block < 1:
-            msg = f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}"
-            raise SimulationError(msg)
+            raise SimulationError(f"a plan is made of {wanted}, got {str(asdict(self))[:400]}")
+        if min(self.count, self.pivots, self.poses_per_pair, self.block) < 1:
+            raise SimulationError(f"count, pivots, poses_per_pair and block must be at least 1, got {asdict(self)}")
         is_listed = isinstance(self.postures, (list, tuple)) and len(self.postures) > 0
         if not is_listed or not all(isinstance(name, str) and name in POSTURES for name in self.postures):
-            msg = f"wanted names of postures, from {', '.join(POSTURES)[:160]}…, got {str(self.postures)[:80]}"
-            raise SimulationError(msg)
+            known = f"{', '.join(POSTURES)[:160]}…"
+            raise SimulationError(f"wanted names of postures, from {known}, got {str(self.postures)[:80]}")
         of_poses = self.recorded_share, self.posture_share
         if not (0 <= self.test_share < 1 and min(of_poses) >= 0 and sum(of_poses) <= 1 and self.spread > 0):
             wanted = "shares must lie in [0, 1), those of poses sum up to 1 at most, and the spread be above 0"
-            msg = f"{wanted}, got {asdict(self)}"
-            raise SimulationError(msg)
+            raise SimulationError(f"{wanted}, got {asdict(self)}")
 
     @property
     def n_test(self) -> int:
@@ -103,7 +98,7 @@ class SamplePlan:
     @property
     def n_pivot(self) -> int:
         """Training samples of the pivots: the first ones of the set."""
-        return int((self.count - self.n_test) * MAX_PIVOTS_SHARE)
+        return (self.count - self.n_test) // 2
 
     def pair_of(self, slot: int) -> int:
         """Number of the style-shape pair of a slot; the pivots are 0 to `pivots` - 1."""

@@ -1,4 +1,4 @@
-"""Where poses come from: frames of recorded motions, and samples within the limits of human joints."""
+"""Where poses come from: recorded motions, everyday postures that these lack, and samples within joints' limits."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from refu_core.body import MIRRORED_JOINTS
 from refu_core.errors import SimulationError
 from refu_core.frames import N_JOINTS
 from refu_core.recordings import SUFFIXES, Axes, interpolated, n_resampled, read_recording
+from refu_core.skeleton import JOINT_NAMES, posed
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
 # is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,
@@ -56,8 +57,7 @@ class Clip:
         try:
             wanted = np.minimum(np.arange(n_resampled(n, self.fps, fps)) * (self.fps / fps), n - 1)
         except ValueError as error:
-            msg = f"{self.name}: {error}"
-            raise SimulationError(msg) from error
+            raise SimulationError(f"{self.name}: {error}") from error
         poses, transl = interpolated(self.poses, self.transl, np.arange(n), wanted)
         return Clip(self.name, poses.astype(np.float32), transl, fps, self.notes)
 
@@ -84,8 +84,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     for file in files:
         found = read_recording(file, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
         if not (np.isfinite(found.poses).all() and np.isfinite(found.transl).all()):
-            msg = f"{file}: wanted finite poses and trans; cut out the frames that aren't"
-            raise SimulationError(msg)
+            raise SimulationError(f"{file}: wanted finite poses and trans; cut out the frames that aren't")
         name = file.relative_to(folder).with_suffix("").as_posix()
         clips.append(Clip(name, found.poses, found.transl, found.fps, found.notes))
     return clips
@@ -152,3 +151,77 @@ def clip_pose(clips: Sequence[Clip], rng: np.random.Generator) -> tuple[NDArray[
     if rng.random() < 0.5:
         pose = mirrored(pose)
     return without_heading(pose), which, frame
+
+
+POSTURES = {
+    "hanging arms": "both_shoulder 18 -16 -83, both_elbow 0 -9 0",
+    "crossed arms": "left_shoulder 38 -67 -54, left_elbow 0 -95 0, right_shoulder 28 68 52, right_elbow 0 87 0",
+    "hands on hips": "both_shoulder 72 -19 -52, both_elbow 0 -85 0",
+    "hands in the lap": "both_shoulder 17 -35 -76, both_elbow 0 -61 0, both_hip -88 0 5, both_knee 85 0 0",
+    "squat": "pelvis 30 0 0, spine1 10 0 0, spine2 10 0 0, neck -15 0 0, both_shoulder -36 -56 -64, "
+    "both_elbow 0 -28 0, both_hip -118 0 14, both_knee 125 0 0, both_ankle -30 0 0",
+    "sitting": "both_shoulder -4 -13 -80, both_elbow 0 -59 0, both_hip -85 0 8, both_knee 82 0 0",
+    "prayer": "both_shoulder 18 -37 -66, both_elbow 0 -117 0",
+    "lying curled up": "pelvis 0 0 90, spine1 18 0 0, spine2 18 0 0, spine3 12 0 0, neck 22 0 0, head 12 0 0, "
+    "both_shoulder -25 -55 -73, both_elbow 0 -91 0, both_hip -115 0 -10, both_knee 122 0 0, both_ankle 15 0 0",
+    "arms overhead": "both_collar 0 0 22, both_shoulder 8 -14 62, both_elbow 0 -15 0",
+    "one arm overhead": "left_collar 0 0 22, left_shoulder 8 -14 62, left_elbow 0 -20 0, "
+    "right_shoulder 18 16 83, right_elbow 0 9 0",
+    "hands behind the head": "both_collar 0 0 12, both_shoulder -90 -32 22, both_elbow 0 -125 0",
+    "hands behind the back": "both_shoulder 67 14 -72, both_elbow 0 -70 0",
+    "hand at the ear": "left_shoulder -67 12 -68, left_elbow 0 -135 0, right_shoulder 18 16 83, right_elbow 0 9 0",
+    "reaching forward": "both_collar 0 -10 0, both_shoulder 3 -75 -4, both_elbow 0 -15 0",
+    "bent to the floor": "pelvis 45 0 0, spine1 25 0 0, spine2 15 0 0, spine3 10 0 0, both_shoulder 7 -75 -9, "
+    "both_elbow 0 -10 0, both_hip -60 0 3, both_knee 20 0 0",
+    "kneeling": "both_shoulder 18 -30 -76, both_elbow 0 -35 0, both_hip -10 0 6, both_knee 95 0 0, both_ankle 20 0 0",
+    "crawling": "pelvis 80 0 0, neck -20 0 0, head -15 0 0, both_shoulder 0 -80 0, both_elbow 0 -10 0, "
+    "both_hip -75 0 4, both_knee 85 0 0, both_ankle 25 0 0",
+    "lunge": "left_hip -75 0 4, left_knee 80 0 0, right_hip 20 0 -4, right_knee 55 0 0, both_shoulder 10 -25 -70, "
+    "both_elbow 0 -40 0",
+    "cross-legged": "both_shoulder 14 -30 -72, both_elbow 0 -45 0, both_hip -89 80 -10, both_knee 122 0 0",
+    "straddle": "both_shoulder 12 -50 -40, both_elbow 0 -15 0, both_hip -78 22 40, both_knee 8 0 0",
+    "deep lunge": "left_hip -98 0 6, left_knee 98 0 0, right_hip 35 0 -5, right_knee 25 0 0, "
+    "both_shoulder 10 -30 -60, both_elbow 0 -50 0",
+    "side lunge": "pelvis 15 0 0, left_hip -55 15 42, left_knee 92 0 0, right_hip -12 0 -40, both_shoulder 0 -55 -45, "
+    "both_elbow 0 -55 0",
+    "high kick": "spine1 8 0 0, left_hip -98 0 5, left_knee 18 0 0, right_hip 6 0 0, both_shoulder 18 -16 -83, "
+    "both_elbow 0 -9 0",
+    "side kick": "pelvis 0 0 -20, left_hip -18 0 45, left_knee 12 0 0, right_hip 0 0 18, both_shoulder 0 -50 -40, "
+    "both_elbow 0 -80 0",
+    "hugging oneself": "left_collar 0 -12 0, right_collar 0 12 0, left_shoulder 28 -78 -38, left_elbow 0 -105 0, "
+    "right_shoulder 14 80 28, right_elbow 0 98 0",
+    "lying on the back": "pelvis -90 0 0, both_shoulder 8 -10 -62, both_hip -8 0 8, both_knee 12 0 0",
+    "lying on the belly": "pelvis 90 0 0, neck -25 0 0, both_shoulder -18 8 38, both_elbow 0 -75 0, both_hip 0 0 8",
+    "lying on the side": "pelvis 0 0 90, left_shoulder 0 0 55, right_shoulder 18 28 68, right_elbow 0 42 0, "
+    "both_hip -28 0 0, both_knee 42 0 0",
+}
+"""By name: rotation vectors [degrees] in SMPL's axes, x to the left, as `refu_core.skeleton.posed` reads them."""
+SELF_TOUCHING = tuple(POSTURES)[:8]
+"""The postures in which the skin intersects itself."""
+FIRST_POSTURES = tuple(POSTURES)[:18]
+"""The postures of plans that don't say which."""
+_SPREAD = 8.0
+"""Standard deviation of a drawn posture's joints about the named one, in each coordinate [degrees]."""
+_STIFF = tuple(JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right") for name in ("foot", "wrist", "hand"))
+"""Joints that affect no garment; they aren't varied."""
+
+
+def posture(name: str) -> NDArray[np.float32]:
+    """One of `POSTURES`, rotation vectors [rad], shape (24, 3). Raises `KeyError` for another name."""
+    pose: NDArray[np.float32] = np.radians(posed(POSTURES[name])).astype(np.float32)
+    return pose
+
+
+def drawn_posture(rng: np.random.Generator, names: Sequence[str]) -> tuple[NDArray[np.float32], int]:
+    """One of the postures `names`, varied at random, mirrored or not, without heading; and its number in `POSTURES`.
+
+    Rotation vectors [rad], shape (24, 3).
+    """
+    name = names[int(rng.integers(len(names)))]
+    noise = np.radians(rng.normal(0.0, _SPREAD, (len(JOINT_NAMES), 3)))
+    noise[_STIFF, :] = 0.0
+    named = Rotation.from_rotvec(posture(name).astype(np.float64))
+    pose = (Rotation.from_rotvec(noise) * named).as_rotvec().astype(np.float32)
+    if rng.random() < 0.5:
+        pose = mirrored(pose)
+    return without_heading(pose), tuple(POSTURES).index(name)

@@ -12,17 +12,90 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from refu_core._engine import Engine, InProcess, Lost
+from refu_core._files import replacing
 from refu_core._versions import versions
 from refu_core.errors import SimulationError
-from refu_core.simulation._plan import SamplePlan
-from refu_core.simulation._poses import Clip, as_clips, split_clips
-from refu_core.simulation._postures import POSTURES
-from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import QUANTUM, TO_DO, Rows, has_rows, locked, read_card, write_card
-from refu_core.simulation._summary import summarise
+from refu_core.frames import N_JOINTS
+from refu_core.simulation._plan import TEST, TRAIN, SamplePlan
+from refu_core.simulation._poses import POSTURES, Clip, as_clips, split_clips
+from refu_core.simulation._store import (
+    CAUSES,
+    DONE,
+    FORMAT,
+    FPS,
+    GIVEN_UP,
+    QUANTUM,
+    SEQUENCES,
+    TO_DO,
+    Rows,
+    has_rows,
+    locked,
+    read_card,
+    write_card,
+)
 from refu_core.simulation._worker import SimulationSettings, Simulator, SlotSimulator
+
+
+def summarise(output: str | Path) -> dict[str, Any]:
+    """Brings a set's card up to date: counts, yield by cause, stretch, pace; for samples, `unseen.npy`, too.
+
+    A test sample's distance to the training set is the smallest Euclidean one in (θ, β, γ), as in the paper's
+    supplement; it is in `unseen.npy`, by slot.
+
+    Raises `SimulationError` when `output` holds no set.
+    """
+    output = Path(output)
+    card = read_card(output, FORMAT, SEQUENCES)
+    stored = Rows(output, card["format"])
+    rows = stored.finished(DONE, GIVEN_UP)
+    column = {name: values[rows] for name, values in stored.arrays.items() if name != "vertices"}
+    done = column["state"] == DONE
+    dropped = column["dropped"].sum(0, dtype=np.int64)
+    train, test = (int((done & (column["split"] == split)).sum()) for split in (TRAIN, TEST))
+    counts = {"train": train, "test": test, "given_up": int((~done).sum()), "to_do": card["plan"]["count"] - len(done)}
+    figures: dict[str, float] = {}
+    seconds = float(column["seconds"].sum())
+    if card["format"] == SEQUENCES:
+        good = column["cause"] == 0
+        kept = good & done[:, None]
+        simulated = int(done.sum()) * round(card["plan"]["seconds"] * FPS)
+        counts |= {"frames": simulated, "frames_kept": int(kept.sum())}
+        if done.any():
+            shares = good[done].mean(1)
+            figures["seconds_a_frame"] = seconds / simulated
+            figures["kept_share_of_worst_sequence"] = float(shares.min())
+            figures["kept_share_of_median_sequence"] = float(np.median(shares))
+    else:
+        kept = done
+        simulated = int(kept.sum() + dropped.sum())
+        with replacing(output / "unseen.npy") as file:
+            np.save(file, _unseen(column, card["plan"]["count"]))
+        if done.any():
+            figures["seconds_a_sample"] = seconds / int(done.sum())
+    if kept.any():
+        figures["stretch_p999_median"] = float(np.median(column["stretch"][kept]))
+        figures["stretch_p999_largest"] = float(column["stretch"][kept].max())
+        figures["speed_m_s_median"] = float(np.median(column["speed"][kept]))
+    share, causes = float(kept.sum() / max(simulated, 1)), dict(zip(CAUSES, dropped.tolist(), strict=True))
+    card |= {"counts": counts, "yield": {"simulated": simulated, "kept_share": share, "dropped": causes}}
+    card |= {"figures": figures} if figures else {}
+    write_card(output, card)
+    return card
+
+
+def _unseen(column: dict[str, NDArray[Any]], count: int) -> NDArray[np.float32]:
+    """By slot, how far each test sample is from the nearest training sample (count,); NaN for the others."""
+    unseen = np.full(count, np.nan, np.float32)
+    kept = column["state"] == DONE
+    train, test = (kept & (column["split"] == split) for split in (TRAIN, TEST))
+    parameters = np.concatenate([column["pose"].reshape(len(kept), 3 * N_JOINTS), column["betas"], column["style"]], 1)
+    if train.any():
+        for row in np.flatnonzero(test):
+            unseen[column["slot"][row]] = np.sqrt(((parameters[train] - parameters[row]) ** 2).sum(1).min())
+    return unseen
 
 
 @dataclass(frozen=True)
@@ -37,26 +110,26 @@ class Progress:
     """What failed in the finished slots, by cause: attempts at a sample, frames of a sequence."""
 
 
-def _block_maker(make: Callable[[], Simulator]) -> Callable[[list[int]], list[dict[str, Any]]]:
-    """Makes a process's function from slots to their rows; `make` is small enough to be sent to that process."""
-    return make().block
+def _block_of(simulator: type[Simulator], *given: Any) -> Callable[[list[int]], list[dict[str, Any]]]:
+    """Makes a process's function from slots to their rows; all that it is given is sent to that process."""
+    return simulator(*given).block
 
 
 def produce(
-    make: Callable[[], Simulator],
-    output: Path,
-    *,
+    kind: type[Simulator],
+    *given: Any,
+    output: str | Path,
     engine: Engine | None,
     progress: Callable[[Progress], None] | None,
     **card: Any,
-) -> None:
-    """Simulates what is left of the set in `output`; `card` is added to the set's card. Raises as `simulate_dataset`.
+) -> dict[str, Any]:
+    """Simulates what is left of the set in `output`; returns its card, with `card` in it. Raises as `simulate_dataset`.
 
-    `make` makes a process's simulator; it is sent to each process, so it is small. Only this process writes rows,
-    whichever process has simulated them: other machines needn't see the folder.
+    Each process makes a simulator of this kind from what is `given`. Only this process writes rows, whichever process
+    has simulated them: other machines needn't see the folder.
     """
     # Also made here, though workers make their own: an unsuitable body or garment is refused before any writing.
-    simulator = make()
+    simulator, output = kind(*given), Path(output)
     blocks = [list(block) for block in simulator.plan.blocks()]
     slots = np.array([slot for block in blocks for slot in block], np.int32)
     _open_set(output, _card_of(simulator) | card)
@@ -65,11 +138,10 @@ def produce(
     with locked(output):
         rows = Rows(output, simulator.kind, mode="r+")
         if not np.array_equal(rows.arrays["slot"], slots):
-            msg = f"{output}: holds other slots than this plan's; give another output directory"
-            raise SimulationError(msg)
+            raise SimulationError(f"{output}: holds other slots than this plan's; give another output directory")
         state, row_of = rows.arrays["state"], {int(slot): row for row, slot in enumerate(slots)}
         left = [[slot for slot in block if state[row_of[slot]] == TO_DO] for block in blocks]
-        make_block: Callable[[], Callable[[list[int]], list[dict[str, Any]]]] = partial(_block_maker, make)
+        make_block: Callable[[], Callable[[list[int]], list[dict[str, Any]]]] = partial(_block_of, kind, *given)
         if engine is None or isinstance(engine, InProcess):  # one slot at a time is on disk soonest
             engine, make_block = InProcess(), lambda: simulator.block
             left = [[slot] for block in left for slot in block]
@@ -90,6 +162,7 @@ def produce(
             msg = f"{lost} of {total} slots were lost with their processes (out of memory?): "
             msg += "finished samples are kept, run the same command to go on"
             raise SimulationError(msg)
+    return summarise(output)
 
 
 def _card_of(simulator: Simulator) -> dict[str, Any]:
@@ -114,10 +187,7 @@ def _card_of(simulator: Simulator) -> dict[str, Any]:
         "plan": asdict(simulator.plan) | {"garment": garment.name},  # whatever its file was called
         "settings": asdict(simulator.settings),
         "clips": {"train": [clip.name for clip in clips[0]], "test": [clip.name for clip in clips[1]]},
-        "versions": {
-            "python": platform.python_version(),
-            **versions("numpy", "torch", "warp-lang", "numba"),
-        },
+        "versions": {"python": platform.python_version(), **versions("numpy", "torch", "warp-lang", "numba")},
     }
 
 
@@ -136,8 +206,7 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
             write_card(output, card)
             return
     except OSError as error:
-        msg = f"{output}: can't be written: {error}"
-        raise SimulationError(msg) from error
+        raise SimulationError(f"{output}: can't be written: {error}") from error
     there, wanted = read_card(output, card["format"]), json.loads(json.dumps(card))
     differing = [key for key in _MUST_AGREE if there.get(key) != wanted[key]]
     if differing:
@@ -152,15 +221,10 @@ def simulate_dataset(
     *,
     motions: str | Path | Sequence[Clip] | None = None,
     body: str | Path | None = None,
-    seed: int = 0,
     engine: Engine | None = None,
-    test_share: float = 1 / 6,
-    recorded_share: float = SamplePlan.recorded_share,
-    posture_share: float = SamplePlan.posture_share,
-    postures: Sequence[str] = tuple(POSTURES),
-    pivots: int = SamplePlan.pivots,
     settings: SimulationSettings | None = None,
     progress: Callable[[Progress], None] | None = None,
+    **plan: Any,
 ) -> dict[str, Any]:
     """Simulates a data set of `count` samples of a built-in garment, or goes on with one that was interrupted.
 
@@ -168,20 +232,14 @@ def simulate_dataset(
     samples are on disk at any time and can be read while others are made.
 
     Args:
-        garment: `tshirt-male` or another garment, or several that are worn together: their layers never cross.
-        count: samples in the set, training and test together.
+        garment, count: as in `SamplePlan`; the layers of garments that are worn together never cross.
         output: directory of the set; it is made, or must hold the beginning of the same set.
         motions: a folder of motion files, or what `load_clips` has read, two at least; None for drawn poses alone.
         body: name or file of a body; None for the one the garment was cut for.
-        seed: seed of everything that is drawn.
         engine: what shares the work among processes (`refu_lab.fleet.open_engine`); None to use this one alone.
-        test_share: share of the samples that is kept for the test.
-        recorded_share: share of the poses that are frames of the motions.
-        posture_share: share of the poses that are varied everyday postures; the others are drawn.
-        postures: which of `POSTURES` these are.
-        pivots: style-shape pairs that half of the training samples share.
         settings: settings of simulation and selection.
         progress: called in this process after each slot.
+        plan: other fields of `SamplePlan`, such as `seed` and `posture_share`; without `postures`, all are drawn.
 
     Returns:
         The card of the set, as it stands in `card.json`.
@@ -194,17 +252,8 @@ def simulate_dataset(
         BodyError, GarmentError: no such body or garment.
     """
     clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(as_clips(motions))
-    recorded_share = 0.0 if motions is None else recorded_share
-    plan = SamplePlan(
-        garment,
-        count,
-        seed,
-        test_share=test_share,
-        pivots=pivots,
-        recorded_share=recorded_share,
-        posture_share=posture_share,
-        postures=postures,
-    )
-    make = partial(SlotSimulator, plan, clips, settings or SimulationSettings(), body)
-    produce(make, Path(output), engine=engine, progress=progress)
-    return summarise(output)
+    if motions is None:
+        plan["recorded_share"] = 0.0
+    slots = SamplePlan(garment, count, **({"postures": tuple(POSTURES)} | plan))
+    given = slots, clips, settings or SimulationSettings(), body
+    return produce(SlotSimulator, *given, output=output, engine=engine, progress=progress)

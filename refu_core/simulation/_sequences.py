@@ -7,12 +7,13 @@ import time
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from refu_core._engine import Engine
 from refu_core.errors import SimulationError
@@ -20,14 +21,75 @@ from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import GRAVITY
-from refu_core.simulation._motion import FPS, STEPS, DrawnMotion, draw_motion
 from refu_core.simulation._plan import TEST, TRAIN, names_of, truncated_normal
-from refu_core.simulation._poses import Clip, as_clips, split_clips
+from refu_core.simulation._poses import Clip, as_clips, mirrored, split_clips, without_heading
 from refu_core.simulation._produce import Progress, produce
-from refu_core.simulation._selection import CAUSES
-from refu_core.simulation._store import DONE, SEQUENCES
-from refu_core.simulation._summary import summarise
+from refu_core.simulation._store import CAUSES, DONE, FPS, SEQUENCES
 from refu_core.simulation._worker import FARTHEST, SimulationSettings, Simulator
+
+STEPS = 2
+"""Simulated frames per frame of the sequence."""
+_SMOOTH = 2.0  # simulated frames: standard deviation of the low-pass on recorded translations, which jitter
+_MOST_ACCELERATION = 20.0  # [m/s²]: as in a jump; more is an error of the recording
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnMotion:
+    """A stretch of a clip as n simulated frames, `STEPS` per frame of the sequence."""
+
+    poses: NDArray[np.float32]
+    """Rotation vectors [rad], shape (n, 24, 3); the first one faces +z."""
+    transl: NDArray[np.float64]
+    """Translations [m], shape (n, 3); x and z start at 0."""
+    clip: int
+    """Number of the clip."""
+    start: float
+    """Where in the clip it starts [s]."""
+    mirrored: bool
+    """Whether left and right are exchanged."""
+
+    def acceleration(self) -> NDArray[np.float64]:
+        """Acceleration of the root, smoothed and limited [m/s²], shape (n, 3)."""
+        if len(self.transl) < 3:
+            return np.zeros_like(self.transl)
+        smooth = gaussian_filter1d(self.transl, _SMOOTH, axis=0, mode="nearest")
+        second = np.gradient(np.gradient(smooth, axis=0), axis=0) * (FPS * STEPS) ** 2
+        size = np.linalg.norm(second, axis=1, keepdims=True)
+        limited: NDArray[np.float64] = second * np.minimum(1, _MOST_ACCELERATION / np.maximum(size, 1e-9))
+        return limited
+
+
+def n_steps(n_frames: int) -> int:
+    """Simulated frames of a sequence of `n_frames`: its frames and those between them."""
+    return (n_frames - 1) * STEPS + 1
+
+
+def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) -> DrawnMotion:
+    """A stretch of `n_frames` at `FPS` of one of the clips, mirrored or not.
+
+    Raises `SimulationError` when no clip is that long.
+    """
+    rate, n = FPS * STEPS, n_steps(n_frames)
+    lengths = np.array([int((len(clip.poses) - 1) / clip.fps * rate + 1e-9) + 1 for clip in clips])
+    long = np.flatnonzero(lengths >= n)
+    if not len(long):
+        got = f"{lengths.max() / rate:.1f} s" if len(lengths) else "none"
+        wanted = f"motions of {n_frames / FPS:g} s at least in training and test"
+        raise SimulationError(f"wanted {wanted}, the longest has {got}: ask for less")
+    weights = np.sqrt(lengths[long])
+    which = int(rng.choice(long, p=weights / weights.sum()))
+    first = int(rng.integers(lengths[which] - n + 1))
+    mirror = bool(rng.random() < 0.5)
+    clip = clips[which].resampled(rate)
+    poses, transl = clip.poses[first : first + n].copy(), clip.transl[first : first + n].copy()
+    if mirror:
+        poses = np.stack([mirrored(pose) for pose in poses])
+        transl[:, 0] *= -1
+    root = Rotation.from_rotvec(poses[:, 0].astype(np.float64))
+    heading = Rotation.from_rotvec(without_heading(poses[0])[0].astype(np.float64)) * root[0].inv()
+    poses[:, 0] = (heading * root).as_rotvec()
+    transl -= transl[0] * (1, 0, 1)
+    return DrawnMotion(poses, heading.apply(transl), which, first / rate, mirror)
 
 
 @dataclass(frozen=True)
@@ -56,8 +118,7 @@ class SequencePlan:
             msg = f"wanted a sequence and a shape at least, and two frames to 600 s, got {asdict(self)}"
             raise SimulationError(msg)
         if not (0 <= self.test_share < 1 and self.spread > 0):
-            msg = f"the test's share must lie in [0, 1) and the spread above 0, got {asdict(self)}"
-            raise SimulationError(msg)
+            raise SimulationError(f"the test's share must lie in [0, 1) and the spread above 0, got {asdict(self)}")
 
     @property
     def n_frames(self) -> int:
@@ -172,27 +233,23 @@ def simulate_sequences(
     output: str | Path,
     *,
     motions: str | Path | Sequence[Clip] | None,
-    shapes: int = 5,
-    seconds: float = 10.0,
     body: str | Path | None = None,
-    seed: int = 0,
     engine: Engine | None = None,
     settings: SequenceSettings | None = None,
     progress: Callable[[Progress], None] | None = None,
+    **plan: Any,
 ) -> dict[str, Any]:
     """Simulates a set of `count` sequences of a built-in garment, or goes on with one that was interrupted.
 
-    It works as `simulate_dataset`, but what is finished or not is a whole sequence. It is best to make `count` a
-    multiple of `shapes`, the number of body shapes in the set. `motions` are required. A sequence is `seconds` long, so
-    only motions of at least that length are used.
+    It works as `simulate_dataset`, but `plan` are fields of `SequencePlan`, `motions` are required, and whole
+    sequences are finished or not. It is best to make `count` a multiple of `shapes`. Only motions that last at least
+    `seconds` are used.
 
     Raises as `simulate_dataset`, and `SimulationError` for motions that are too short.
     """
+    slots = SequencePlan(garment, count, **plan)
     if motions is None:
-        msg = f"sequences need recorded motion: give a folder of motion files, of {seconds:g} s or more each"
+        msg = f"sequences need recorded motion: give a folder of motion files, of {slots.seconds:g} s or more each"
         raise SimulationError(msg)
-    plan = SequencePlan(garment, count, shapes=shapes, seconds=seconds, seed=seed)
-    clips = split_clips(as_clips(motions))
-    make = partial(SequenceSimulator, plan, clips, settings or SequenceSettings(), body)
-    produce(make, Path(output), engine=engine, progress=progress, fps=FPS)
-    return summarise(output)
+    given = slots, split_clips(as_clips(motions)), settings or SequenceSettings(), body
+    return produce(SequenceSimulator, *given, output=output, engine=engine, progress=progress, fps=FPS)

@@ -22,12 +22,15 @@ from numpy.typing import NDArray
 from refu_core._files import exclusive, open_file, read_json, replacing
 from refu_core._npz import DAMAGE, check_npy
 from refu_core.errors import SimulationError
-from refu_core.simulation._selection import CAUSES
 
 FORMAT = "refu-garments-2"
 SEQUENCES = "refu-sequences-2"
 QUANTUM = 2.0**-14
 """Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm per axis."""
+CAUSES = ("body_collision", "self_intersection", "stretch", "unsettled")
+"""Why a sample isn't taken, in the order of the checks."""
+FPS = 30
+"""Frames of a sequence [1/s]."""
 TO_DO, DONE, GIVEN_UP = 0, 1, 2
 _ROWS = "shard-0-of-1"
 _MAX_BYTES = 1 << 40
@@ -67,14 +70,10 @@ def columns_of(kind: str, shape: tuple[int, ...]) -> Columns:
 
 
 def quantise(vertices: NDArray[np.floating]) -> NDArray[np.int16]:
-    """Positions [m] within ±2 m in units of `QUANTUM`.
-
-    Raises `SimulationError` for positions that don't fit.
-    """
+    """Positions [m] within ±2 m in units of `QUANTUM`. Raises `SimulationError` for positions that don't fit."""
     units = np.rint(np.asarray(vertices, np.float64) / QUANTUM)
     if not np.abs(units).max(initial=0) < 2**15:
-        msg = "a garment more than 2 m away from its body can't be stored: the simulation has failed"
-        raise SimulationError(msg)
+        raise SimulationError("a garment more than 2 m away from its body can't be stored: the simulation has failed")
     return units.astype(np.int16)
 
 
@@ -99,8 +98,7 @@ class Rows:
         """
         self.directory = output / _ROWS
         if not has_rows(output):
-            msg = f"{output}: no shard: wanted a folder {_ROWS} beside the card"
-            raise SimulationError(msg)
+            raise SimulationError(f"{output}: no shard: wanted a folder {_ROWS} beside the card")
         self.arrays: dict[str, Any] = {
             name: _mapped(self.directory / f"{name}.npy", mode) for name in columns_of(kind, ())
         }
@@ -149,8 +147,7 @@ class Rows:
 
     def write(self, row: int, values: dict[str, Any]) -> None:
         """Fills a row; `state` last."""
-        names = [name for name in values if name != "state"]
-        for name in (*names, "state"):
+        for name in sorted(values, key=lambda name: name == "state"):
             self.arrays[name][row] = values[name]
             self.arrays[name].flush()
 
@@ -161,12 +158,10 @@ def _mapped(path: Path, mode: Literal["r", "r+"] = "r") -> NDArray[Any]:
         with open_file(path, most=_MAX_BYTES, error=SimulationError, wanted="a column of a data set") as file:
             rows = check_npy(file, file.size)[0][:1]  # numpy would lengthen a file that was cut short
         if rows > (_MAX_ROWS,):
-            msg = f"{rows[0]} rows, at most {_MAX_ROWS} are read"
-            raise ValueError(msg)
+            raise ValueError(f"{rows[0]} rows, at most {_MAX_ROWS} are read")
         array: NDArray[Any] = np.load(path, mmap_mode=mode)
     except DAMAGE as error:
-        msg = f"{path}: not a column of a data set, or a damaged one: {error}"
-        raise SimulationError(msg) from error
+        raise SimulationError(f"{path}: not a column of a data set, or a damaged one: {error}") from error
     return array
 
 
@@ -194,19 +189,15 @@ def write_card(directory: Path, card: dict[str, Any]) -> None:
         file.write((json.dumps(card, indent=1) + "\n").encode())
 
 
-def write_unseen(directory: Path, values: NDArray[np.float32]) -> None:
-    """Writes the distance of each slot's sample to the training set (count,), in one step."""
-    with replacing(directory / "unseen.npy") as file:
-        np.save(file, values)
-
-
 def read_unseen(directory: Path, count: int) -> NDArray[np.float32]:
-    """What `write_unseen` has written; NaN until it has. Raises `SimulationError` for a damaged file."""
+    """Distance of each slot's sample to the training set; NaN until `summarise` has written it.
+
+    Raises `SimulationError` for a damaged file.
+    """
     path = directory / "unseen.npy"
     if not path.exists():
         return np.broadcast_to(np.float32(np.nan), count)
     found = _mapped(path)
     if found.shape != (count,) or found.dtype != np.float32:
-        msg = f"{path}: wanted float32 of shape {(count,)}, got {found.dtype} of {found.shape}"
-        raise SimulationError(msg)
+        raise SimulationError(f"{path}: wanted float32 of shape {(count,)}, got {found.dtype} of {found.shape}")
     return found

@@ -1,4 +1,4 @@
-"""Simulates slots of a set: what is common to samples and sequences, and the row of a sample."""
+"""Simulates slots of a set, and says which drapes may enter it: exact checks, and limits on stretch and speed."""
 
 from __future__ import annotations
 
@@ -12,13 +12,51 @@ import numpy as np
 
 from refu_core.body import load_body, load_fit
 from refu_core.garments import load_garment, worn_on
+from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import Draper, DrapeSettings
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import TEST, SamplePlan, garments_of
 from refu_core.simulation._poses import Clip
-from refu_core.simulation._selection import CAUSES, SelectionSettings, Selector
-from refu_core.simulation._store import DONE, FORMAT, GIVEN_UP, dequantise, quantise
+from refu_core.simulation._store import CAUSES, DONE, FORMAT, GIVEN_UP, dequantise, quantise
+
+
+@dataclass(frozen=True)
+class SelectionSettings:
+    """Limits on the drapes that are taken."""
+
+    stretch: float = 1.15
+    """Limit on the 99.9th percentile of edge length over the length that the edge reaches freely."""
+    speed: float = 0.10
+    """Limit on the root mean square speed that is left [m/s]: a faster cloth hasn't settled."""
+
+
+class Selector:
+    """Says why a drape can't be taken, judged as it will be stored."""
+
+    def __init__(self, body_faces: Any, garment_faces: Any, *, settings: SelectionSettings | None = None) -> None:
+        """For a garment on a body, faces of the shape (F, 3) each."""
+        self.settings = settings or SelectionSettings()
+        self._garment_faces = np.ascontiguousarray(garment_faces, dtype=np.int32)
+        self._body = CollisionChecker(body_faces)
+        self._itself = SheetChecker(garment_faces)
+
+    def cause(self, vertices: F32, body: F32, *, stretch: float = 1.0, speed: float = 0.0) -> str | None:
+        """One of `CAUSES`, or None for a drape that can be taken.
+
+        `vertices` (N, 3) are the garment's as they will be read back, `body` (V, 3) those of the body below it [m];
+        `stretch` and `speed` are those of `SettledDrape`.
+        """
+        self._body.update(body)
+        if not self._body.check(vertices, self._garment_faces).is_free:
+            return "body_collision"
+        self._itself.update(vertices)
+        if len(self._itself.with_itself()):
+            return "self_intersection"
+        if stretch > self.settings.stretch:
+            return "stretch"
+        return "unsettled" if speed > self.settings.speed else None
+
 
 FARTHEST = 1.9
 """Cloth farther away along an axis [m] counts as lost: `quantise` doesn't reach much farther."""
@@ -41,11 +79,7 @@ class Simulator(ABC):
     """Format of the set."""
 
     def __init__(
-        self,
-        plan: Any,
-        clips: tuple[list[Clip], list[Clip]],
-        settings: SimulationSettings,
-        body: str | Path | None,
+        self, plan: Any, clips: tuple[list[Clip], list[Clip]], settings: SimulationSettings, body: str | Path | None
     ) -> None:
         """For clips of the training and the test set, on `body`, or on the one the garment is cut for if None.
 

@@ -35,20 +35,21 @@ from refu_core.garments import N_STYLES, GarmentTemplate, load_garment, worn_on
 from refu_core.modes import SdfMode
 from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
 from refu_core.training._data import (
+    Mirror,
+    SurfaceMixture,
     TrainingSamples,
     TrainingSet,
+    backbone_figures,
     in_chunks,
     mirrored,
+    mpve,
     principal_components,
     read_samples,
 )
-from refu_core.training._figures import backbone_figures, mpve
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
-from refu_core.training._mirror import Mirror, SurfaceMixture
-from refu_core.training._pretrain import CodeLoss
+from refu_core.training._pretrain import code_loss
 from refu_core.weights import load_weights, save_weights
 
-_CHUNK = 32
 _DOUBT = 0.1
 """Damps what is carried over where it varies by less than about this share of its mean variation."""
 BASE = SdfMode.HYBRID
@@ -83,8 +84,7 @@ class CarrySettings:
     def __post_init__(self) -> None:
         """Raises `RefuError` for sizes that make no network."""
         if min(self.rank, self.poses, self.steps, *self.hidden) < 1 or not self.ridge > 0:
-            msg = f"rank, poses, steps, layers and ridge must be above zero, got {self}"
-            raise RefuError(msg)
+            raise RefuError(f"rank, poses, steps, layers and ridge must be above zero, got {self}")
 
 
 class Carried:
@@ -98,10 +98,7 @@ class Carried:
     def __init__(
         self, related: GarmentTemplate, garment: GarmentTemplate, body: SmplBody, settings: CarrySettings
     ) -> None:
-        """For `garment` on its `body`; `related` lies near the garment once it is worn on the same body.
-
-        Raises `WeightsError` when no networks of `related` ship.
-        """
+        """For `garment` on its `body`. Raises `WeightsError` when no networks of `related` ship."""
         self.network = load_backbone("tailornet", related, mode=SdfMode.HYBRID)
         fit = None if garment.body == related.body else load_fit(garment.body)
         self._betas = None if fit is None else fit.difference(related.body).betas
@@ -130,7 +127,7 @@ class Carried:
             posed = self._posed_as.pose(rest + self._mixed(there), transforms)
             return self._garment.unpose(posed, transforms) - rest
 
-        return in_chunks(one, betas, pose, size=_CHUNK)
+        return in_chunks(one, betas, pose, size=32)
 
 
 def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -157,24 +154,15 @@ def carry_over(
 ) -> dict[str, Any]:
     """Makes a garment's networks from those of a related one and few samples; writes `output`/basis and all modes.
 
-    Args:
-        garment: as in `pretrain`; on its own body.
-        dataset: as in `pretrain`; fifty samples are enough to be useful.
-        output: folder of the weights.
-        like: name of the related garment, one whose networks ship.
-        settings: the default ones if not given.
-        body, quiet: as in `pretrain`.
-
-    Returns:
-        The card: what was made of what, and its figures on the test split.
+    Fifty samples are enough to be useful. `like` is the name of the related garment, one whose networks ship. All else,
+    and what is returned, is as in `pretrain`.
 
     Raises:
         RefuError: the set is of another garment or body, or too small.
         GarmentError: there is no such related garment.
         WeightsError: no networks of the related garment ship, or `output` can't be written.
     """
-    settings = CarrySettings() if settings is None else settings
-    output = Path(output)
+    settings, output = settings or CarrySettings(), Path(output)
     require_basis(output, None, written=[f"tailornet-{mode}" for mode in SdfMode])
     opened = TrainingSet.of(garment, dataset, body)
     template, body = opened.garment, opened.body
@@ -198,7 +186,11 @@ def carry_over(
     with torch.no_grad():  # one pivot: there is nothing to choose between
         for parameter in (*model.style_shape.parameters(), *model.high.parameters()):
             parameter.zero_()
-    _learn_carried(model, template, drawn, there, output, settings, described, quiet=quiet)
+    stage = _of_carried(model, template, *drawn, there, settings.steps)
+    identity = [described, asdict(settings)]
+    loop = Loop(model, settings.loop, output / "carried", identity, torch.device("cpu"), quiet=quiet)
+    loop.run(stage)
+    loop.checkpoint.unlink(missing_ok=True)
     _add_linear(model, samples, settings.ridge)
     model.eval()
 
@@ -261,19 +253,10 @@ def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, 
     return torch.as_tensor(betas, dtype=torch.float32), torch.as_tensor(pose, dtype=torch.float32)
 
 
-def _learn_carried(
-    model: TailorNet,
-    garment: GarmentTemplate,
-    drawn: tuple[Tensor, Tensor],
-    there: Tensor,
-    output: Path,
-    settings: CarrySettings,
-    identity: dict[str, Any],
-    *,
-    quiet: bool,
-) -> None:
-    """Teaches the low-frequency net what is carried over, `there` (P, V, 3) [m], at the bodies `drawn`."""
-    betas, pose = drawn
+def _of_carried(
+    model: TailorNet, garment: GarmentTemplate, betas: Tensor, pose: Tensor, there: Tensor, steps: int
+) -> TrainingStage:
+    """Teaches the low-frequency net what is carried over, `there` (P, V, 3) [m], to these bodies."""
     x, s = model.features(pose), torch.cat((betas, betas.new_zeros(len(betas), N_STYLES)), 1)
     code = in_chunks(model.decoder.encode, there, size=256)
     bounded = model.features.are_bounded(garment)
@@ -281,18 +264,7 @@ def _learn_carried(
     model.low.scale[-N_STYLES:] = 0  # a garment of one style ignores γ
     held_out = len(x) // 12
     parts = [(x[rows], s[rows], code[rows]) for rows in (slice(held_out, None), slice(held_out))]
-    loop = Loop(
-        model,
-        settings.loop,
-        folder=output,
-        name="carried",
-        identity=[identity, asdict(settings)],
-        device=torch.device("cpu"),
-        quiet=quiet,
-    )
-    objective = Objective([model.low], model.low_code, CodeLoss(model))
-    loop.run(TrainingStage("carried", objective, settings.steps, *parts))
-    loop.checkpoint.unlink(missing_ok=True)
+    return TrainingStage("carried", Objective([model.low], model.low_code, code_loss(model)), steps, *parts)
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What backbones learn from: unposed displacements of a simulated set, mirrored, split, and as codes of a basis."""
+"""What backbones learn from, unposed displacements of a simulated set, mirrored, too; and how far off they are."""
 
 from __future__ import annotations
 
@@ -9,21 +9,81 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core.backbones import BasisDecoder, style_shape
-from refu_core.body import Collider, SmplBody, load_body
-from refu_core.errors import RefuError
+from refu_core.backbones import Backbone, BasisDecoder, style_shape
+from refu_core.body import MIRRORED_JOINTS, Collider, SmplBody, load_body
+from refu_core.errors import GarmentError, RefuError
 from refu_core.garments import GarmentTemplate, SkinBelow, load_garment
 from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, dequantise, open_dataset
-from refu_core.training._mirror import Mirror, mirror_pose
+
+MAX_ASYMMETRY = 5e-3
+"""A template that is anywhere farther than this from its mirror image counts as asymmetric [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMixture:
+    """Places on a garment: each lies in a triangle, and takes a weighted mean of the values at its three corners."""
+
+    corners: Tensor
+    """Vertices of the triangles, shape (P, 3), int64."""
+    weights: Tensor
+    """How much each corner counts, shape (P, 3)."""
+
+    @staticmethod
+    def nearest(
+        garment: GarmentTemplate, points: NDArray[np.float64]
+    ) -> tuple[SurfaceMixture, NDArray[np.float64], NDArray[np.float64]]:
+        """The places nearest to points (P, 3) [m]; their positions [m], (P, 3), and distances [m], (P,)."""
+        vertices, faces = garment.v_template.cpu().double().numpy(), garment.faces.cpu().numpy()
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        places, distance, triangle = trimesh.proximity.closest_point(mesh, points)
+        barycentrics = trimesh.triangles.points_to_barycentric(vertices[faces[triangle]], places)
+        return SurfaceMixture(torch.as_tensor(faces[triangle]), torch.as_tensor(barycentrics)), places, distance
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """Values at the places, shape (B, P, K), from values at the garment's vertices (B, V, K)."""
+        weights = self.weights.to(values.dtype)
+        corners = (weights[:, k, None] * values[:, self.corners[:, k]] for k in range(3))
+        return sum(corners, start=torch.zeros(()))
+
+
+def mirror_pose(pose: Tensor) -> Tensor:
+    """The same pose in a mirror at x = 0: rotation vectors [rad], shape (B, 24, 3)."""
+    return pose[:, MIRRORED_JOINTS] * pose.new_tensor((1.0, -1.0, -1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror:
+    """Where each vertex of a garment lies in its mirror image.
+
+    The garments' surfaces are symmetric, but their meshes aren't: a mirrored vertex lies in a triangle, and takes a
+    weighted mean of its three corners. The body and the bases of shape and style are symmetric, so β and γ stay.
+    """
+
+    image: SurfaceMixture
+
+    @staticmethod
+    def of(garment: GarmentTemplate) -> Mirror:
+        """The mirror image of a garment. Raises `GarmentError` where it isn't symmetric."""
+        mirrored = garment.v_template.cpu().double().numpy() * np.array((-1.0, 1.0, 1.0))
+        image, _, distance = SurfaceMixture.nearest(garment, mirrored)
+        if distance.max() > MAX_ASYMMETRY:
+            msg = f"{garment.name} is off its mirror image by {1e3 * distance.max():.1f} mm; train it without mirroring"
+            raise GarmentError(msg)
+        return Mirror(image)
+
+    def displacement(self, displacement: Tensor) -> Tensor:
+        """Displacements of the mirrored garment, from `displacement`; both (B, V, 3) [m]."""
+        mixed = self.image(displacement)
+        return mixed * mixed.new_tensor((-1.0, 1.0, 1.0))
+
 
 _SPARE = 32
 """Extra components that a randomised decomposition finds: the last ones that it finds are the least accurate."""
-_SWEEPS = 4
-"""Power iterations of the randomised decomposition."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,25 +168,15 @@ class TrainingSet:
 
 
 class TakenAlong:
-    """How far `refu_core.realtime.dress` moves cloth along with skin that gives way, in unposed displacements.
-
-    Networks needn't predict this part.
-    """
+    """How far `dress` moves cloth along with skin that gives way, unposed: networks needn't predict this part."""
 
     def __init__(self, body: SmplBody, garment: GarmentTemplate) -> None:
         self._body, self._garment = body, garment
         self._collider, self._below = Collider(body), SkinBelow.of(garment, body)
 
-    def without(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
-        """The part of simulated displacements (B, N, 3) [m] that a network has to predict."""
-        return self._moved(displacement, betas, pose, style, -1.0)
-
-    def with_it(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
-        """The inverse of `without`."""
-        return self._moved(displacement, betas, pose, style, 1.0)
-
     @torch.no_grad()
-    def _moved(self, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor, sign: float) -> Tensor:
+    def added(self, sign: int, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        """Displacements (B, N, 3) [m] with it, or, with a `sign` of -1, simulated ones without it."""
         garment, shape = self._garment, self._body.shape(betas)
         _, at_root = RootTurn.taken_off(pose, shape.joints)
         posed = self._body.posed(at_root, shape)
@@ -154,24 +204,22 @@ def read_samples(
     if not len(rows):
         msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
         raise RefuError(msg)
-    names = ("vertices", "pose", "betas", "style", "pair")
     if isinstance(dataset, GarmentSequences):
         stored = _frames(dataset, rows)
     else:
-        stored = {name: dataset.column(name)[rows] for name in names}
+        stored = {name: dataset.column(name)[rows] for name in ("vertices", "pose", "betas", "style", "pair")}
     vertices = stored.pop("vertices")[:, dataset.parts[garment.name]]
-    column = {name: torch.as_tensor(values) for name, values in stored.items()}
-
+    pose, betas, style, pair = (torch.as_tensor(stored[name]) for name in ("pose", "betas", "style", "pair"))
     along = TakenAlong(body, garment)
 
     def displacement(units: NDArray[np.int16], pose: Tensor, betas: Tensor, style: Tensor) -> Tensor:
         posed = torch.as_tensor(dequantise(units))
         whole = garment.unpose(posed, body(pose, betas).transforms) - garment.rest(betas, garment.own(style))
-        return along.without(whole, betas, pose, style)
+        return along.added(-1, whole, betas, pose, style)
 
     with torch.no_grad():
-        found = in_chunks(displacement, vertices, column["pose"], column["betas"], column["style"])
-    return TrainingSamples(column["pose"], column["betas"], column["style"], found, column["pair"].long())
+        found = in_chunks(displacement, vertices, pose, betas, style)
+    return TrainingSamples(pose, betas, style, found, pair.long())
 
 
 def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
@@ -184,11 +232,8 @@ def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDAr
 
 def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
     """The mirror images of the samples."""
-    return replace(
-        samples,
-        pose=mirror_pose(samples.pose),
-        displacement=in_chunks(mirror.displacement, samples.displacement),
-    )
+    turned = in_chunks(mirror.displacement, samples.displacement)
+    return replace(samples, pose=mirror_pose(samples.pose), displacement=turned)
 
 
 def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tuple[TrainingSamples, TrainingSamples]:
@@ -196,15 +241,12 @@ def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tu
 
     With a `share` of 0 the validation part is empty.
     """
-    held_out = drawn_pairs(samples.pair, share=share, seed=seed)
+    # With fewer pairs than five none are held out: the rest would be too similar to learn from.
+    held_out = drawn_pairs(samples.pair, share=share, seed=seed, fewest=5)
     return samples.take(~held_out), samples.take(held_out)
 
 
-_FEWEST_PAIRS = 5
-"""With fewer pairs than this none are held out: the rest would be too similar to learn from."""
-
-
-def drawn_pairs(pair: Tensor, *, share: float, seed: int, fewest: int = _FEWEST_PAIRS) -> Tensor:
+def drawn_pairs(pair: Tensor, *, share: float, seed: int, fewest: int) -> Tensor:
     """Which of N samples, of the style-shape pairs `pair` (N,), are chosen: bool, shape (N,).
 
     Whole pairs are drawn as long as they stay within `share`; at least one if there are `fewest` pairs or more, unless
@@ -230,15 +272,14 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     """
     n = len(values)
     if n < 2:  # to learn it well takes hundreds
-        msg = f"an output basis needs 2 samples at least, got {n}: simulate more"
-        raise RefuError(msg)
+        raise RefuError(f"an output basis needs 2 samples at least, got {n}: simulate more")
     rank = min(rank, n - 1)
     mean = values.mean(0)
     centred = (values - mean).flatten(1)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         # Randomised: an exact decomposition takes 7 s for 3,000 samples and, growing with the cube, minutes for 12,000.
-        _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=_SWEEPS)
+        _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=4)
     return mean, components[:, :rank].T.contiguous()
 
 
@@ -252,3 +293,50 @@ def check_set(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garmen
             got = dataset.card.get(what)
             msg = f"wanted a set whose {what} is {wanted}, got {got}: simulate one with `refu simulate {garment.name}`"
             raise RefuError(msg)
+
+
+@torch.no_grad()
+def displacements(backbone: Backbone, samples: TrainingSamples) -> Tensor:
+    """What a backbone predicts for samples [m], shape (N, V, 3); zero for one without a network."""
+
+    def predict(betas: Tensor, pose: Tensor, style: Tensor, truth: Tensor) -> Tensor:
+        predicted = backbone(betas, pose, style)
+        return torch.zeros_like(truth) if predicted is None else predicted
+
+    return in_chunks(predict, samples.betas, samples.pose, samples.style, samples.displacement, size=32)
+
+
+@torch.no_grad()
+def posed_errors(predicted: Tensor, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> Tensor:
+    """Errors of posed vertices [mm], shape (N, V), for predicted displacements (N, V, 3) [m] (the paper's MPVE)."""
+
+    def error(predicted: Tensor, truth: Tensor, pose: Tensor, betas: Tensor) -> Tensor:
+        rotation = garment.vertex_transforms(body(pose, betas).transforms).rotation
+        distance: Tensor = (rotation @ (predicted - truth).unsqueeze(-1)).squeeze(-1).norm(dim=-1)
+        return 1e3 * distance
+
+    return in_chunks(error, predicted, samples.displacement, samples.pose, samples.betas, size=32)
+
+
+def mpve(predicted: Tensor, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> float:
+    """Mean of `posed_errors` [mm]."""
+    return round(float(posed_errors(predicted, samples, body, garment).mean()), 3)
+
+
+def backbone_figures(
+    backbone: Backbone, samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate, *, mean: Tensor
+) -> dict[str, Any]:
+    """MPVE on the test split [mm], beside baselines to compare it with.
+
+    `skinned_mm` is without a network, `mean_mm` with the best constant displacement (`mean`, shape (V, 3)), and
+    `basis_mm` the least that the output basis allows.
+    """
+    truth, decoder = samples.displacement, getattr(backbone, "decoder", None)
+    shown = {
+        "mpve_mm": displacements(backbone, samples),
+        "skinned_mm": torch.zeros_like(truth),
+        "mean_mm": mean.expand_as(truth),
+    }
+    if isinstance(decoder, BasisDecoder):
+        shown["basis_mm"] = decoder(decoder.encode(truth))
+    return {"samples": len(samples), **{name: mpve(one, samples, body, garment) for name, one in shown.items()}}

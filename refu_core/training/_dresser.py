@@ -1,4 +1,4 @@
-"""A backbone with ReFU on it, as it is trained: from body parameters to garments and their distance to the body."""
+"""A backbone with ReFU on it, as it is trained: from body parameters to garments and their distance; and losses."""
 
 from __future__ import annotations
 
@@ -15,6 +15,38 @@ from refu_core.garments import GarmentTemplate
 from refu_core.realtime import Outfit, Wearable, Wearer, dress
 from refu_core.refu import Refu
 from refu_core.sdf import BAND, ApproxSdf, BodySdf, SdfSample, exact_sdf
+
+
+def refu_loss(
+    vertices: Tensor,
+    truth: Tensor,
+    distance: Tensor,
+    *,
+    reconstruction_weight: float = 1.5,
+    collision_weight: float = 0.5,
+) -> Tensor:
+    """L = λ₁ L_r + λ₂ L_c of garments after ReFU (paper, Eq. 7), with its weights λ₁ and λ₂ (Sec. 4.2), shape ().
+
+    L_r is `reconstruction_loss`, L_c `collision_loss`. With positions in metres both are about 1e-4 for a good
+    backbone, which is what the paper's weights balance. `vertices` and `truth` are garments [m], shape (B, N, 3),
+    `distance` the signed distance of `vertices` [m], (B, N).
+    """
+    return reconstruction_weight * reconstruction_loss(vertices, truth) + collision_weight * collision_loss(distance)
+
+
+def reconstruction_loss(vertices: Tensor, truth: Tensor) -> Tensor:
+    """L_r: squared distance to the truth [m²], shape () (paper, Eq. 8).
+
+    The paper's sum over vertices is divided by their number, here and in L_c. Adam doesn't see a common factor, and
+    garments of different sizes can be compared.
+    """
+    return (vertices - truth).square().sum(dim=-1).mean()
+
+
+def collision_loss(distance: Tensor) -> Tensor:
+    """L_c: depth inside the body, max(-f, 0) (paper, Eq. 9), mean over vertices [m], shape ()."""
+    return (-distance).clamp_min(0).mean()
+
 
 Sdf = Literal["accurate", "approx"]
 
@@ -33,9 +65,9 @@ class Dresser(nn.Module):
         refu: Refu | None,
         garment: GarmentTemplate,
         body: SmplBody,
-        *,
         in_refu: Sdf,
         in_loss: Sdf,
+        *,
         is_blended: bool = True,
     ) -> None:
         """For one garment on its body, both on one device; without `refu` the garment stays as predicted.

@@ -18,11 +18,19 @@ from refu_core.frames import SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.history import PoseHistory
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import TrainingSamples, TrainingSet, in_chunks, mirrored, read_samples, split_validation
-from refu_core.training._figures import mpve
+from refu_core.training._data import (
+    Mirror,
+    TrainingSamples,
+    TrainingSet,
+    in_chunks,
+    mirror_pose,
+    mirrored,
+    mpve,
+    read_samples,
+    split_validation,
+)
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._mirror import Mirror, mirror_pose
-from refu_core.training._pretrain import CodeLoss
+from refu_core.training._pretrain import code_loss
 from refu_core.weights import load_weights
 
 
@@ -93,8 +101,7 @@ def train_dynamics(
     stored = load_weights(folder / f"tailornet-{mode}", expect=opened.identity)
     still = backbone_from_weights(stored, template)
     if not isinstance(still, TailorNet):
-        msg = f"{stored.path}: wanted a tailornet, got {type(still).__name__}"
-        raise RefuError(msg)
+        raise RefuError(f"{stored.path}: wanted a tailornet, got {type(still).__name__}")
     settings = DynamicsSettings() if settings is None else settings
     torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):
@@ -112,15 +119,8 @@ def train_dynamics(
         "settings": asdict(settings),
         "samples": len(train.code),
     }
-    loop = Loop(
-        dynamics,
-        settings.loop,
-        folder=folder,
-        name="dynamics",
-        identity=[described, asdict(dynamics.config)],
-        device=torch_device,
-        quiet=quiet,
-    )
+    identity = [described, asdict(dynamics.config)]
+    loop = Loop(dynamics, settings.loop, folder / "dynamics", identity, torch_device, quiet=quiet)
     dynamics.to(torch_device)
 
     def predict(x: Tensor, s: Tensor, past: Tensor) -> Tensor:
@@ -129,7 +129,7 @@ def train_dynamics(
         code: Tensor = dynamics(x, s, past)
         return code
 
-    objective = Objective([dynamics], predict, CodeLoss(still))
+    objective = Objective([dynamics], predict, code_loss(still))
     loop.run(TrainingStage("dynamics", objective, settings.steps, train, validation))
     dynamics.to("cpu").eval()
     figures = _figures(still, dynamics, test, _prepared(still, test, _pasts(rows, rows.test)), body, template)

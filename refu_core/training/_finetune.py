@@ -23,11 +23,17 @@ from refu_core.garments import GarmentTemplate
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import TakenAlong, TrainingSamples, TrainingSet, in_chunks, mirrored, split_validation
-from refu_core.training._dresser import Dresser, Sdf
+from refu_core.training._data import (
+    Mirror,
+    TakenAlong,
+    TrainingSamples,
+    TrainingSet,
+    in_chunks,
+    mirrored,
+    split_validation,
+)
+from refu_core.training._dresser import Dresser, Sdf, refu_loss
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._losses import refu_loss
-from refu_core.training._mirror import Mirror
 from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages
 from refu_core.weights import load_weights
 
@@ -35,20 +41,14 @@ _UNIT = 1e3
 """Factor on the loss, so that its curves show readable numbers. It makes no difference to Adam."""
 
 
-@dataclass(frozen=True)
-class _Mode:
-    in_refu: Sdf | None
-    in_loss: Sdf
-    least: float
-
-
-_MODES: dict[str, _Mode] = {
-    "approx": _Mode("approx", "approx", 0.0),
-    "accurate": _Mode("accurate", "accurate", 1.0),
-    "hybrid": _Mode("approx", "accurate", 0.0),
-    "collision-approx": _Mode(None, "approx", 1.0),
-    "collision-accurate": _Mode(None, "accurate", 1.0),
+_MODES: dict[str, tuple[Sdf, Sdf, float | None]] = {
+    "approx": ("approx", "approx", 0.0),
+    "accurate": ("accurate", "accurate", 1.0),
+    "hybrid": ("approx", "accurate", 0.0),
+    "collision-approx": ("approx", "approx", None),
+    "collision-accurate": ("accurate", "accurate", None),
 }
+"""The distance in ReFU and in the loss, and ReFU's least scale; None without ReFU."""
 FINETUNE_MODES: tuple[str, ...] = tuple(_MODES)
 """The paper's three settings: approximate or accurate distance everywhere; or hybrid, accurate in the loss and
 approximate in ReFU. And its baseline, a collision loss without ReFU, with either distance."""
@@ -125,14 +125,12 @@ def finetune(
         WeightsError: no such backbone or preset, weights that are missing, damaged or of another garment.
     """
     if mode not in _MODES:
-        msg = f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}"
-        raise RefuError(msg)
-    if settings is None:
-        settings = FinetuneSettings.of(backbone, preset)
+        raise RefuError(f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}")
+    settings = settings or FinetuneSettings.of(backbone, preset)
     opened = TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
-    torch_device = start_parallel(device)
-    output = Path(output)
+    torch_device, output = start_parallel(device), Path(output)
+    stem = output / f"{backbone}-{mode}"
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
         train = train.joined(mirrored(train, Mirror.of(template)))
@@ -141,56 +139,35 @@ def finetune(
         torch.manual_seed(settings.loop.seed)
         if weights is None:
             config = backbone_config(backbone, template, preset=preset)
-            basis = None
-            if uses_basis(config, preset):
-                basis = basis_of(output, opened, None, PretrainSettings().rank)
+            basis = basis_of(output, opened, None, PretrainSettings().rank) if uses_basis(config, preset) else None
             network = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
             # Called because it sets the scale of inputs and outputs; the stages themselves aren't run.
             stages(network, train, validation, template, PretrainSettings())
         else:
             stored = load_weights(Path(weights) / f"{backbone}-none", expect=identity)
             network = backbone_from_weights(stored, template)
-            bring_basis(Path(weights), output, written=f"{backbone}-{mode}")
+            bring_basis(Path(weights), output, written=stem.name)
         refu = _layer(mode, settings, template.n_vertices)
-    described = {
-        **identity,
-        "backbone": backbone,
-        "preset": preset,
-        "mode": mode,
-        "settings": asdict(settings),
-        "samples": len(train),
-        "from_scratch": weights is None,
-    }
-    found = _MODES[mode]
-    dresser = Dresser(
-        network,
-        refu,
-        template.to(device=torch_device),
-        body.to(device=torch_device),
-        in_refu=found.in_refu or found.in_loss,
-        in_loss=found.in_loss,
-        is_blended=settings.is_blended,
-    ).to(torch_device)
-    name = f"{backbone}-{mode}"
-    loop = Loop(dresser, settings.loop, folder=output, name=name, identity=described, device=torch_device, quiet=quiet)
+    described = {**identity, "backbone": backbone, "preset": preset, "mode": mode, "settings": asdict(settings)}
+    described |= {"samples": len(train), "from_scratch": weights is None}
+    in_refu, in_loss, _ = _MODES[mode]
+    garment, there = template.to(device=torch_device), body.to(device=torch_device)
+    dresser = Dresser(network, refu, garment, there, in_refu, in_loss, is_blended=settings.is_blended).to(torch_device)
+    loop = Loop(dresser, settings.loop, stem, described, torch_device, quiet=quiet)
 
     def loss(dressed: Tensor, truth: Tensor) -> Tensor:
-        """Loss of garments with their distance, (B, N, 4), against the true garments, (B, N, 3) [m]."""
+        """Of garments with their distance, (B, N, 4), against the true garments, (B, N, 3) [m]."""
         return _UNIT * refu_loss(dressed[..., :3], truth, dressed[..., 3])
 
     objective = Objective([dresser], dresser, loss)
     data = [_tensors(part, body, template) for part in (train, validation)]
     loop.run(TrainingStage("refu", objective, settings.steps, train=data[0], validation=data[1]))
     dresser.to("cpu").eval()
-    card = {
-        **described,
-        "refu": None if refu is None else refu.config,
-        "dataset": opened.card,
-        "knows_limbs": opened.knows_limbs,
-    }
+    card = described | {"refu": refu.config if refu else None, "dataset": opened.card}
+    card["knows_limbs"] = opened.knows_limbs
     if is_writer():
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")
-        save_backbone(output / name, network, card, others=others, half=preset != "paper")
+        save_backbone(stem, network, card, others=others, half=preset != "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 
@@ -202,7 +179,7 @@ def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate)
 
     def posed(displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
         rest = garment.rest(betas, garment.own(style))
-        whole = along.with_it(displacement, betas, pose, style)
+        whole = along.added(1, displacement, betas, pose, style)
         return garment.pose(rest + whole, body(pose, betas).transforms)
 
     inputs = samples.betas, samples.pose, samples.style
@@ -211,14 +188,15 @@ def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate)
 
 
 def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | None:
-    if _MODES[mode].in_refu is None:
+    least = _MODES[mode][2]
+    if least is None:
         return None
     if settings.scale is not None and settings.scale not in SCALE_PRESETS:
         msg = f"no preset {settings.scale!r} of the scale networks: wanted {', '.join(SCALE_PRESETS)} or None"
         raise RefuError(msg)
     return Refu(
         n_vertices,
-        least=_MODES[mode].least,
+        least=least,
         scale=None if settings.scale is None else replace(SCALE_PRESETS[settings.scale], kind=settings.scale_kind),
         margin=settings.margin,
     )

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from refu_core.errors import RefuError
-from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
-from refu_core.training._progress import TrainingLog
+from refu_core.training._record import TrainingLog, load_checkpoint, save_checkpoint
 
 
 @dataclass(frozen=True)
@@ -55,41 +54,37 @@ class TrainingStage:
     """What is trained on what."""
 
     name: str
-    objective: Objective
+    objective: nn.Module
+    """An `Objective`, or another module from a batch to its loss."""
     steps: int
-    train: tuple[Tensor, ...]
+    train: tuple[Tensor, ...] = ()
     """Inputs and, last, targets; each of the shape (N, ...)."""
-    validation: tuple[Tensor, ...]
+    validation: tuple[Tensor, ...] = ()
     """The same for the validation samples, of which there may be none."""
-    rate: float = field(default=1.0, kw_only=True)
+    _: KW_ONLY
+    rate: float = 1.0
     """Learning rate, relative to the settings'."""
+    draw: Callable[[int], Any] | None = None
+    """Draws the batch of a step, for this process and on its device, where it isn't some rows of `train`."""
+    learning_rate: Callable[[int], float] | None = None
+    """Learning rate of a step, instead of the usual rise and fall."""
+    watch: Callable[[], dict[str, float]] | None = None
+    """What is recorded at checks, by name, instead of the loss."""
 
 
 class Loop:
     """Runs stages one after another; if interrupted, it goes on from the last checkpoint to the same weights."""
 
     def __init__(
-        self,
-        model: nn.Module,
-        settings: LoopSettings,
-        *,
-        folder: Path,
-        name: str,
-        identity: Any,
-        device: torch.device,
-        quiet: bool,
+        self, model: nn.Module, settings: LoopSettings, stem: Path, identity: Any, device: torch.device, *, quiet: bool
     ) -> None:
-        """Keeps a checkpoint and loss curves, `folder`/`name` with suffixes of their own.
+        """Keeps a checkpoint and loss curves, `stem` with suffixes of their own.
 
-        `identity` says what is trained how and on what: a checkpoint of anything else is refused.
-
-        Raises:
-            RefuError: the checkpoint there is of another training.
-            WeightsError: it is damaged.
+        `identity` says what is trained how and on what. Raises as `load_checkpoint` does.
         """
-        self.checkpoint = folder / f"{name}.checkpoint"
+        self.checkpoint = stem.with_name(f"{stem.name}.checkpoint")
         self._model, self._settings, self._device = model, settings, device
-        self._log = TrainingLog(folder, name=name, quiet=quiet, is_writer=is_writer())
+        self._log = TrainingLog(stem.parent, name=stem.name, quiet=quiet, is_writer=is_writer())
         self._identity = json.dumps(identity, sort_keys=True, default=str)
         self._done: list[str] = []
         self._resumed: dict[str, Any] | None = None
@@ -131,14 +126,19 @@ class Loop:
         stepper: nn.Module = objective
         if world > 1:
             stepper = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
-        n, losses = len(stage.train[0]), []
+        losses = []
         while step < stage.steps and since < settings.patience:
             objective.train()
+            usual = settings.learning_rate * stage.rate * _schedule(step, stage.steps)
             for group in optimiser.param_groups:
-                group["lr"] = settings.learning_rate * stage.rate * _schedule(step, stage.steps)
-            rows = torch.randint(n, (settings.batch_size,), generator=order)[rank::world].to(stage.train[0].device)
+                group["lr"] = usual if stage.learning_rate is None else stage.learning_rate(step)
+            if stage.draw is None:
+                rows = torch.randint(len(stage.train[0]), (settings.batch_size,), generator=order)[rank::world]
+                batch = [t[rows.to(t.device)].to(self._device) for t in stage.train]
+            else:
+                batch = [stage.draw(step)]
             with torch.autocast(self._device.type, torch.bfloat16, enabled=self._device.type == "cuda"):
-                loss = stepper(*(t[rows].to(self._device) for t in stage.train))
+                loss = stepper(*batch)
             optimiser.zero_grad(set_to_none=True)
             loss.backward()
             optimiser.step()
@@ -162,8 +162,10 @@ class Loop:
                     best_state = {k: v.detach().clone() for k, v in objective.state_dict().items()}
                 if held_out is None:
                     since = 0
-                shown = {} if held_out is None else {"validation": held_out}
-                self._log.check(stage.name, step, train=train_loss, **shown)
+                shown = {"train": train_loss} if held_out is None else {"train": train_loss, "validation": held_out}
+                if stage.watch is not None and is_writer():
+                    shown = stage.watch()
+                self._log.check(stage.name, step, **shown)
                 self._save(
                     {
                         "name": stage.name,
@@ -182,7 +184,7 @@ class Loop:
 
     @torch.no_grad()
     def _validate(self, stage: TrainingStage) -> float | None:
-        n = len(stage.validation[0])
+        n = len(stage.validation[0]) if stage.validation else 0
         if n == 0:
             return None
         stage.objective.eval()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -39,17 +39,17 @@ from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import (
+    Mirror,
     TrainingSamples,
     TrainingSet,
+    backbone_figures,
     in_chunks,
     mirrored,
     output_basis,
     read_samples,
     split_validation,
 )
-from refu_core.training._figures import backbone_figures
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._mirror import Mirror
 from refu_core.training._rehearsal import Rehearsal, plans_of
 from refu_core.weights import load_weights
 
@@ -148,11 +148,9 @@ def pretrain(
     test = read_samples(opened.rows, body, template, split="test")  # a missing test split is reported first
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
     if start is None and (rehearsal is not None or joints or mode != "none"):
-        msg = "there is nothing to go on from or to rehearse without weights to start from"
-        raise RefuError(msg)
-    torch_device = start_parallel(device)
-    output = Path(output)
-
+        raise RefuError("there is nothing to go on from or to rehearse without weights to start from")
+    torch_device, output = start_parallel(device), Path(output)
+    stem = output / f"{backbone}-{mode}"
     mirror = Mirror.of(template) if settings.is_mirrored else None
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     # A rehearsing network can't stray far: with none of 500 samples held out, shorts' last weights are 0.2 mm nearer.
@@ -186,19 +184,11 @@ def pretrain(
         if joints:
             tell_of(model, joints, train.pose)
             config = model.config
-        bring_basis(Path(start), output, written=f"{backbone}-{mode}")
-    loop = Loop(
-        model,
-        settings.loop,
-        folder=output,
-        name=f"{backbone}-{mode}",
-        identity=[described, asdict(config)],
-        device=torch_device,
-        quiet=quiet,
-    )
-    found = stages(model, train, validation, template, settings, goes_on=stored is not None)
+        bring_basis(Path(start), output, written=stem.name)
+    loop = Loop(model, settings.loop, stem, [described, asdict(config)], torch_device, quiet=quiet)
+    to_run = stages(model, train, validation, template, settings, goes_on=stored is not None)
     model.to(torch_device)
-    for stage in found:
+    for stage in to_run:
         loop.run(stage)
     model.to("cpu").eval()
     card = {
@@ -211,7 +201,7 @@ def pretrain(
     if is_writer():
         refu = None if stored is None else refu_from_weights(stored)
         layer = None if refu is None else refu_tensors(refu, half=preset != "paper")
-        save_backbone(output / f"{backbone}-{mode}", model, card, others=layer, half=preset != "paper")
+        save_backbone(stem, model, card, others=layer, half=preset != "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 
@@ -244,12 +234,10 @@ def bring_basis(source: Path, target: Path, *, written: str) -> None:
             if there.exists() and there.samefile(source / name):
                 continue
             target.mkdir(parents=True, exist_ok=True)
-            content = (source / name).read_bytes()
             with replacing(there, sync=True) as file:
-                file.write(content)
+                file.write((source / name).read_bytes())
         except OSError as error:
-            msg = f"{there}: can't be written: {error.strerror or error}"
-            raise WeightsError(msg) from error
+            raise WeightsError(f"{there}: can't be written: {error.strerror or error}") from error
 
 
 def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:
@@ -269,19 +257,18 @@ def stages(
     goes_on: bool = False,
 ) -> list[TrainingStage]:
     """The stages to train, in order; for a network that `goes_on`, the last one alone."""
+    take_inputs(model, train, garment, widen=goes_on)
     if isinstance(model, Gcnn):
         if not goes_on:
             mean = train.displacement.mean(0)
             model.mean.copy_(mean)
             model.scale.copy_((train.displacement - mean).std())
-        take_inputs(model, train, garment, widen=goes_on)
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
         objective = Objective([model], model, _vertex_loss)
         return [TrainingStage("all", objective, settings.steps, *parts)]
-    take_inputs(model, train, garment, widen=goes_on)
     inputs = [(model.features(s.pose), s.style_shape) for s in (train, validation)]
     codes = [in_chunks(model.decoder.encode, s.displacement, size=256) for s in (train, validation)]
-    loss = CodeLoss(model)
+    loss = code_loss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
     if isinstance(model, Mlp):
         return [TrainingStage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
@@ -354,23 +341,17 @@ def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate
             net.standardise(inputs, groups[:n], is_bounded=bounded[:n])
 
 
-class CodeLoss:
-    """Distance between garments [mm].
+def code_loss(model: TailorNet | Mlp) -> Callable[[Tensor, Tensor], Tensor]:
+    """What tells the distance between the garments of two codes [mm].
 
     Dense codes are vertices: L1, as in the original. In an orthonormal basis, distances between codes give root mean
     square distances of vertices; networks trained on these instead of on the L1 of vertices are as good in a quarter of
     the time.
     """
-
-    def __init__(self, model: TailorNet | Mlp) -> None:
-        self._is_low_rank = isinstance(model.decoder, BasisDecoder)
-        self._n_vertices = model.decoder.n_vertices
-
-    def __call__(self, predicted: Tensor, target: Tensor) -> Tensor:
-        if self._is_low_rank:
-            distance: Tensor = 1e3 * (predicted - target).norm(dim=1).mean() / self._n_vertices**0.5
-            return distance
-        return _vertex_loss(predicted, target)
+    if not isinstance(model.decoder, BasisDecoder):
+        return _vertex_loss
+    n = model.decoder.n_vertices
+    return lambda predicted, target: 1e3 * (predicted - target).norm(dim=1).mean() / n**0.5
 
 
 def _vertex_loss(predicted: Tensor, target: Tensor) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +15,8 @@ from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
-from refu_core.training._checkpoint import load_checkpoint, save_checkpoint
 from refu_core.training._data import check_set, drawn_pairs
-from refu_core.training._loop import cosine, is_writer, ranks, start_parallel
-from refu_core.training._progress import TrainingLog
+from refu_core.training._loop import Loop, LoopSettings, TrainingStage, cosine, is_writer, ranks, start_parallel
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
 """λ_a, λ_b and λ_c of the paper's loss."""
@@ -69,8 +65,7 @@ class SdfSettings:
             msg = f"no preset {self.preset!r} of the distance network: wanted one of {', '.join(SDF_PRESETS)}"
             raise RefuError(msg)
         if min(self.steps, self.batch_size, self.check_every) < 1 or self.points < 8 or not self.learning_rate > 0:
-            msg = f"steps, batch_size, points (8 or more) and rates must be positive, got {asdict(self)}"
-            raise RefuError(msg)
+            raise RefuError(f"steps, batch_size, points (8 or more) and rates must be positive, got {asdict(self)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +93,7 @@ class SdfSampler:
 
     def __init__(self, dataset: GarmentDataset, body: SmplBody, garment: GarmentTemplate, rows: Tensor) -> None:
         """For the samples `rows` of a set of `garment`."""
-        self.rows = rows
-        self._dataset = dataset
-        self._body = body
-        self._garment = garment
+        self.rows, self._dataset, self._body, self._garment = rows, dataset, body, garment
         self._part = dataset.parts[garment.name]
         self._exact = ExactSdf(body.faces, device=body.device)
 
@@ -114,20 +106,18 @@ class SdfSampler:
     def around(self, rows: Tensor, generator: torch.Generator, *, points: int, noise: float) -> SdfBatch:
         """`points` around the bodies of these samples."""
         samples = [self._dataset.sample(int(row)) for row in rows]
-        betas = torch.from_numpy(np.stack([sample.betas for sample in samples]))
-        pose = torch.from_numpy(np.stack([sample.pose for sample in samples]))
+        kinds = [(sample.betas, sample.pose, sample.vertices[self._part]) for sample in samples]
+        betas, pose, worn = (torch.from_numpy(np.stack(one)) for one in zip(*kinds, strict=True))
         rotation, root = body_frame(self._body, pose, betas)
-        worn = torch.from_numpy(np.stack([sample.vertices[self._part] for sample in samples]))
         worn = (worn - root[:, None]) @ rotation + root[:, None]
         pose = torch.cat((torch.zeros_like(pose[:, :1]), pose[:, 1:]), 1)
         skins = self._body(pose, betas).vertices
         counts = [int(share * points) for share in _SHARES]
         drawn, normals = [], []
         for skin, cloth in zip(skins, worn, strict=True):
-            on_skin, normal = _on_surface(skin, self._body.faces, counts[0], generator)
-            near_skin, _ = _on_surface(skin, self._body.faces, counts[1], generator)
-            on_cloth, _ = _on_surface(cloth, self._garment.faces, counts[2], generator)
-            near_cloth, _ = _on_surface(cloth, self._garment.faces, counts[3], generator)
+            surfaces = [(skin, self._body.faces)] * 2 + [(cloth, self._garment.faces)] * 2
+            places = [_on_surface(*surface, n, generator) for surface, n in zip(surfaces, counts, strict=True)]
+            (on_skin, normal), (near_skin, _), (on_cloth, _), (near_cloth, _) = places
             disturbed = torch.cat((near_skin, near_cloth))
             disturbed = disturbed + noise * torch.randn(disturbed.shape, generator=generator)
             anywhere = BOX * (torch.rand(points - sum(counts), 3, generator=generator) - 0.5)
@@ -164,12 +154,8 @@ def sdf_loss(distance: Tensor, gradient: Tensor, batch: SdfBatch) -> Tensor:
 def sdf_figures(network: SdfNetwork, batch: SdfBatch) -> dict[str, float]:
     """The supplement's figures of a network: mean absolute error [mm] of all points, mean relative error [%] of those
     that aren't on the surface; and the mean absolute error within 2 cm of the skin [mm]."""
-    found = torch.cat(
-        [
-            network(points[None], betas[None], pose[None])
-            for points, betas, pose in zip(batch.points, batch.betas, batch.pose, strict=True)
-        ]
-    )
+    bodies = zip(batch.points, batch.betas, batch.pose, strict=True)
+    found = torch.cat([network(points[None], betas[None], pose[None]) for points, betas, pose in bodies])
     off = batch.normals.shape[1]
     error, truth = (found - batch.distance).abs(), batch.distance.abs()
     return {
@@ -220,8 +206,7 @@ def train_sdf(
     where = start_parallel(device)
     rank, world = ranks()
     if settings.batch_size % world:
-        msg = f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes"
-        raise RefuError(msg)
+        raise RefuError(f"a batch of {settings.batch_size} bodies can't be shared evenly by {world} processes")
     splits = _split(dataset, settings)
     samplers = {part: SdfSampler(dataset, body, garment, rows) for part, rows in splits.items()}
     checks = {part: _fixed_batch(samplers[part], settings).to(where) for part in ("validation", "test")}
@@ -229,55 +214,33 @@ def train_sdf(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         network = SdfNetwork(SDF_PRESETS[settings.preset]).to(where)
-    optimiser = torch.optim.Adam(network.parameters(), lr=settings.learning_rate)
-    identity = json.dumps(
-        {**asdict(settings), "body": body.fingerprint, "garment": garment.name, "samples": len(splits["train"])}
-    )
-    checkpoint = output / f"{name}.checkpoint"
-    saved, step = load_checkpoint(checkpoint, identity), 0
-    if saved is not None:
-        network.load_state_dict(saved["network"])
-        optimiser.load_state_dict(saved["optimiser"])
-        step = int(saved["step"])
-    module: nn.Module = _Step(network)
-    if world > 1:
-        module = nn.parallel.DistributedDataParallel(module)
-    log = TrainingLog(output, name=name, quiet=quiet, is_writer=is_writer())
-    log.begin("sdf", step=step, steps=settings.steps)
-    while step < settings.steps:
+    about = {"garment": garment.name, "samples": len(splits["train"])}
+    identity = [asdict(settings), body.fingerprint, about]
+    how = LoopSettings(settings.batch_size, settings.learning_rate, 0.0, settings.check_every, seed=settings.seed)
+    loop = Loop(network, how, output / name, identity, where, quiet=quiet)
+
+    def draw(step: int) -> SdfBatch:
         generator = torch.Generator().manual_seed((settings.seed * 1_000_003 + step) * world + rank)
-        batch = samplers["train"].draw(
-            generator, bodies=settings.batch_size // world, points=settings.points, noise=settings.noise
-        )
-        with torch.autocast(where.type, torch.bfloat16, enabled=where.type == "cuda"):
-            loss = module(batch.to(where))
-        for group in optimiser.param_groups:
-            group["lr"] = settings.rate(step)
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-        step += 1
-        log.step(step)
-        if step % settings.check_every == 0 or step == settings.steps:
-            if not math.isfinite(lost := float(loss.detach())):
-                msg = f"the loss of the distance network is {lost} at step {step}: try a smaller learning rate"
-                raise RefuError(msg)
-            if is_writer():
-                found = sdf_figures(network, checks["validation"])
-                log.check("sdf", step, absolute=found["absolute_mm"], near_skin=found["near_mm"])
-                state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
-                save_checkpoint(checkpoint, {"identity": identity, "step": step, **state})
+        bodies = settings.batch_size // world
+        batch = samplers["train"].draw(generator, bodies=bodies, points=settings.points, noise=settings.noise)
+        return batch.to(where)
+
+    def watch() -> dict[str, float]:
+        found = sdf_figures(network, checks["validation"])
+        return {"absolute": found["absolute_mm"], "near_skin": found["near_mm"]}
+
+    hooks: dict[str, Any] = {"draw": draw, "learning_rate": settings.rate, "watch": watch}
+    loop.run(TrainingStage("sdf", _Step(network), settings.steps, **hooks))
     card = {
         "kind": "sdf",
         "body_fingerprint": body.fingerprint,
-        "dataset": {"garment": garment.name, "samples": len(splits["train"])},
+        "dataset": about,
         "settings": asdict(settings),
         "figures": {part: sdf_figures(network, batch) for part, batch in checks.items()},
     }
-    log.end()
     if is_writer():
         save_sdf_network(output / name, network, card)
-        checkpoint.unlink(missing_ok=True)
+        loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
@@ -290,8 +253,7 @@ def _split(dataset: GarmentDataset, settings: SdfSettings) -> dict[str, Tensor]:
     splits = {"train": train & ~held_out, "validation": train & held_out, "test": test}
     for name, mask in splits.items():
         if not bool(mask.any()):
-            msg = f"the set has no finished sample for the {name} part: let `refu simulate` run longer"
-            raise RefuError(msg)
+            raise RefuError(f"the set has no finished sample for the {name} part: let `refu simulate` run longer")
     return {name: torch.nonzero(mask)[:, 0] for name, mask in splits.items()}
 
 

@@ -17,10 +17,8 @@ from torch import Tensor
 
 from refu_core import WeightsError, load_garment
 from refu_core.backbones import (
-    TRAINABLE,
     BasisDecoder,
     Controls,
-    DenseDecoder,
     Gcnn,
     GcnnConfig,
     LaplacianSmoothing,
@@ -33,18 +31,18 @@ from refu_core.backbones import (
     backbone_config,
     backbone_from_weights,
     build_backbone,
-    kernel_weights,
     load_backbone,
     load_basis,
     save_backbone,
     save_basis,
     style_shape,
-    tilt_rotvec,
-    told_up,
-    up_in_root,
 )
-from refu_core.backbones._gcnn import MeshGraph, UpConv
+from refu_core.backbones._decoder import DenseDecoder
+from refu_core.backbones._features import tilt_rotvec, told_up, up_in_root
+from refu_core.backbones._gcnn import UpConv, sampled
 from refu_core.backbones._perceptron import StackedPerceptrons
+from refu_core.backbones._presets import TRAINABLE
+from refu_core.backbones._tailornet import kernel_weights
 from refu_core.body import rotvec_to_rotmat
 from refu_core.errors import RefuError
 from refu_core.garments import PAPER_GARMENTS, GarmentTemplate
@@ -438,25 +436,25 @@ def test_smoothing_of_a_basis_is_smoothing(garment: GarmentTemplate) -> None:
 
 @pytest.mark.parametrize("stride", [2, 3])
 def test_sampled_graphs_cover_the_mesh(garment: GarmentTemplate, stride: int) -> None:
-    graph = MeshGraph.of(garment.mesh, levels=2, stride=stride)
-    assert graph.sizes[0] == garment.n_vertices
-    assert graph.sizes[0] > 3 * graph.sizes[1] > 9 * graph.sizes[2] > 0
-    for fine, coarse, up in zip(graph.sizes[:-1], graph.sizes[1:], graph.ups, strict=True):
+    sizes, ups = sampled(garment.mesh, levels=2, stride=stride)
+    assert sizes[0] == garment.n_vertices
+    assert sizes[0] > 3 * sizes[1] > 9 * sizes[2] > 0
+    for fine, coarse, up in zip(sizes[:-1], sizes[1:], ups, strict=True):
         assert up.index.shape[0] == fine
         assert up.valid[:, 0].all()  # everyone hears someone
         assert set(up.index[up.valid]) == set(range(coarse))  # and everyone is heard
 
 
 def test_up_convolution_is_what_the_formula_says(garment: GarmentTemplate) -> None:
-    graph = MeshGraph.of(garment.mesh, levels=3)
-    up = graph.ups[2]
+    sizes, ups = sampled(garment.mesh, levels=3)
+    up = ups[2]
     for inputs, outputs in ((3, 5), (5, 3), (4, 4)):
         layer = UpConv(up, inputs, outputs, bases=4, residual=0.3)
         torch.nn.init.normal_(layer.density)
         torch.nn.init.normal_(layer.bias)
-        x = torch.randn(graph.sizes[3], 2, inputs)
+        x = torch.randn(sizes[3], 2, inputs)
         got = layer(x)
-        for i in range(0, graph.sizes[2], 7):
+        for i in range(0, sizes[2], 7):
             conv, passed, total = layer.bias.clone(), torch.zeros(outputs), torch.zeros(())
             for n in np.flatnonzero(up.valid[i]):
                 j = int(up.index[i, n])

@@ -35,13 +35,8 @@ from refu_core.errors import FrameError, WeightsError
 from refu_core.frames import LAGS, N_PAST
 from refu_core.metrics import CollisionChecker
 from refu_core.simulation import open_dataset
-from refu_core.training import (
-    DynamicsSettings,
-    LoopSettings,
-    output_basis,
-    read_samples,
-    train_dynamics,
-)
+from refu_core.training import DynamicsSettings, LoopSettings, train_dynamics
+from refu_core.training._data import output_basis, read_samples
 from refu_core.training._pretrain import tell_of
 from refu_core.weights import load_weights
 from refu_lab.stress._frames import promised

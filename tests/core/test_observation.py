@@ -11,7 +11,7 @@ import torch
 
 from refu_core import FrameError, GarmentPipeline, SmplFrame
 from refu_core.observation import DEFAULT_OBSERVATION, Observer
-from refu_core.observation._estimate import Estimate
+from refu_core.observation._cloth import Estimate
 from refu_core.outputs import Clearance, PinholeCamera, depth_image, visible
 from refu_lab.truth import TrueFrame, moments_of
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from refu_core import MeshError, load_garment
 from refu_core.mesh import vertex_normals
-from refu_core.outputs import VertexNormals
+from refu_core.outputs._dressed import VertexNormals
 
 
 @given(st.integers(4, 40), st.integers(1, 80), st.integers(0, 10**6))

@@ -32,7 +32,6 @@ from refu_core.errors import BodyError
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
-    CAUSES,
     POSTURES,
     Draper,
     GarmentDataset,
@@ -49,10 +48,10 @@ from refu_core.simulation import (
     split_clips,
     summarise,
 )
-from refu_core.simulation._drape import canonical_pose, comfort_poses
+from refu_core.simulation._drape import CANONICAL_POSE, COMFORT_POSES
 from refu_core.simulation._plan import TEST, TRAIN
-from refu_core.simulation._selection import Selector
-from refu_core.simulation._store import DONE, FORMAT, QUANTUM, TO_DO, Rows, dequantise, locked, quantise
+from refu_core.simulation._store import CAUSES, DONE, FORMAT, QUANTUM, TO_DO, Rows, dequantise, locked, quantise
+from refu_core.simulation._worker import Selector
 from refu_lab.cli import main
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.fleet import open_engine
@@ -149,7 +148,7 @@ def test_nothing_collides_by_three_judges(samples: list[GarmentSample]) -> None:
 def test_a_hanging_arm_stays_where_it_is() -> None:
     """The skin of arm and flank runs through itself; the sleeve between them is simulated, and is free of both."""
     garment, (body, collider) = load_garment("tshirt-male"), body_and_collider()
-    pose = canonical_pose()
+    pose = CANONICAL_POSE.copy()
     pose[16, 2], pose[17, 2] = -1.35, 1.35
     zeros = np.zeros(10, np.float32)
     drape = Draper(garment, body).drape(pose, zeros, zeros[:4])
@@ -174,7 +173,7 @@ def test_cloth_stretches_little(samples: list[GarmentSample]) -> None:
     for sample in samples:
         shape = torch.from_numpy(sample.betas)[None]
         rest = garment.rest(shape, torch.from_numpy(sample.style)[None])
-        comfort = comfort_poses()
+        comfort = COMFORT_POSES
         transforms = body(comfort, shape).transforms
         eased = length(garment.pose(rest.expand(len(comfort), -1, -1), transforms)).max(0)
         cut = length(rest[0])
@@ -187,7 +186,7 @@ def test_sample_depends_on_nothing_but_its_parameters(samples: list[GarmentSampl
     """Draped after another pose, and by another draper: the bytes of the stored one, which came another way."""
     sample = samples[-1]
     draper = Draper(load_garment(GARMENT), load_body("male"))
-    other = canonical_pose()
+    other = CANONICAL_POSE.copy()
     other[1, 0] = -0.6
     before = draper.drape(other, sample.betas, sample.style)
     drape = draper.drape(sample.pose, sample.betas, sample.style)

@@ -33,13 +33,12 @@ from refu_core.simulation import (
     split_clips,
     summarise,
 )
-from refu_core.simulation._drape import canonical_pose
-from refu_core.simulation._motion import FPS, STEPS, draw_motion, n_steps
+from refu_core.simulation._drape import CANONICAL_POSE
 from refu_core.simulation._plan import TEST
-from refu_core.simulation._selection import Selector
-from refu_core.simulation._store import SEQUENCES, TO_DO, Rows
-from refu_core.training import read_samples
-from refu_core.training._data import TakenAlong
+from refu_core.simulation._sequences import STEPS, draw_motion, n_steps
+from refu_core.simulation._store import FPS, SEQUENCES, TO_DO, Rows
+from refu_core.simulation._worker import Selector
+from refu_core.training._data import TakenAlong, read_samples
 from refu_lab.cli import main
 
 GARMENT = "short-pant-male"
@@ -50,7 +49,7 @@ FRAMES = 9
 def write_clip(path: Path, phase: float, *, frames: int = 40) -> None:
     """Somebody runs on the spot and turns about."""
     t = np.arange(frames) / 60
-    pose = np.tile(canonical_pose(), (frames, 1, 1)).astype(np.float64)
+    pose = np.tile(CANONICAL_POSE, (frames, 1, 1)).astype(np.float64)
     pose[:, 0, 1] = 0.8 + 0.5 * t
     pose[:, 1, 0] = -0.5 * np.sin(9 * t + phase)
     pose[:, 2, 0] = 0.5 * np.sin(9 * t + phase)
@@ -127,7 +126,7 @@ def test_training_reads_the_good_frames(simulated: Path, tmp_path: Path) -> None
     np.testing.assert_array_equal(samples.pose, sequence.pose[good])
     assert (samples.betas == torch.tensor(sequence.betas)).all()
     assert (samples.pair == sequence.number).all()
-    whole = TakenAlong(body, garment).with_it(samples.displacement, samples.betas, samples.pose, samples.style)
+    whole = TakenAlong(body, garment).added(1, samples.displacement, samples.betas, samples.pose, samples.style)
     unposed = garment.rest(samples.betas, samples.style) + whole
     posed = garment.pose(unposed, body(samples.pose, samples.betas).transforms)
     np.testing.assert_allclose(posed, sequence.vertices(good), atol=1e-5)

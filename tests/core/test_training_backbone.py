@@ -31,24 +31,21 @@ from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.realtime import Outfit, Wearable, Wearer, dress
 from refu_core.simulation import GarmentDataset
-from refu_core.training import (
-    LoopSettings,
+from refu_core.training import LoopSettings, PretrainSettings, TrainingLog, pretrain
+from refu_core.training import _loop as loop_module
+from refu_core.training._data import (
     Mirror,
-    PretrainSettings,
-    TrainingLog,
+    TakenAlong,
     TrainingSamples,
     displacements,
-    load_checkpoint,
     mirror_pose,
+    mirrored,
     output_basis,
     posed_errors,
-    pretrain,
     read_samples,
-    save_checkpoint,
     split_validation,
 )
-from refu_core.training import _loop as loop_module
-from refu_core.training._data import TakenAlong, mirrored
+from refu_core.training._record import load_checkpoint, save_checkpoint
 from refu_core.weights import load_weights
 
 GARMENT = "short-pant-male"
@@ -140,7 +137,7 @@ def test_samples_are_unposed_displacements(
     dataset: Path, samples: TrainingSamples, garment: GarmentTemplate, body: SmplBody
 ) -> None:
     assert len(samples) == 200
-    whole = TakenAlong(body, garment).with_it(samples.displacement, samples.betas, samples.pose, samples.style)
+    whole = TakenAlong(body, garment).added(1, samples.displacement, samples.betas, samples.pose, samples.style)
     torch.testing.assert_close(whole, cloth(garment, samples.pose), atol=2e-4, rtol=0)
     assert (samples.displacement - whole).abs().max() > 0.01, "in some of these poses skin gives way"
     wrong = torch.zeros_like(samples.displacement)

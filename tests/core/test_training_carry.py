@@ -17,8 +17,9 @@ from refu_core.errors import WeightsError
 from refu_core.garments import BUILTIN_GARMENTS, save_garment
 from refu_core.modes import SdfMode
 from refu_core.simulation import open_dataset
-from refu_core.training import CarrySettings, carry_over, displacements, posed_errors, read_samples
+from refu_core.training import CarrySettings, carry_over
 from refu_core.training._carry import Carried, _borne_out
+from refu_core.training._data import displacements, posed_errors, read_samples
 from refu_core.weights import load_card, weights_folder
 
 pytestmark = pytest.mark.usefixtures("no_curves_in_module")

@@ -25,8 +25,6 @@ from refu_core.realtime._load import wearable_of
 from refu_core.refu import Refu, trained_from_weights
 from refu_core.sdf import ApproxSdf, ExactSdf, RestFaces, SdfSample
 from refu_core.training import (
-    FINETUNE_MODES,
-    MANY,
     FinetuneSettings,
     LoopSettings,
     PretrainSettings,
@@ -39,6 +37,8 @@ from refu_core.training import (
 from refu_core.training import _loop as loop_module
 from refu_core.training._data import TrainingSet
 from refu_core.training._dresser import Dresser
+from refu_core.training._finetune import FINETUNE_MODES
+from refu_core.training._pretrain import MANY
 from refu_core.weights import load_weights
 
 GARMENT = "short-pant-male"

@@ -11,8 +11,7 @@ import torch
 from refu_core.body import load_body
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
-from refu_core.simulation._drape import Draper
-from refu_core.simulation._untangle import Untangle
+from refu_core.simulation._drape import Draper, Untangle
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

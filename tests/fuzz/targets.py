@@ -24,7 +24,8 @@ from refu_core.refu import trained_from_weights
 from refu_core.sdf._neural import SDF_PRESETS, SdfNetwork, load_sdf_network, save_sdf_network
 from refu_core.simulation import GarmentDataset, GarmentSequences, load_clips
 from refu_core.simulation._store import FORMAT, SEQUENCES
-from refu_core.training import TrainingLog, load_checkpoint, save_checkpoint
+from refu_core.training import TrainingLog
+from refu_core.training._record import load_checkpoint, save_checkpoint
 from refu_core.weights import load_weights
 from tests.fuzz import corpus
 from tests.fuzz import messages as ms

@@ -149,7 +149,7 @@ def count(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return call
 
     for place in (
-        "outputs._normals.VertexNormals.__call__",
+        "outputs._dressed.VertexNormals.__call__",
         "outputs._openings.Openings.frames",
         "outputs._planner.PlannerMesh.solid",
         "outputs._clearance.Clearance.__call__",

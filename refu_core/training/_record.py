@@ -1,15 +1,85 @@
-"""Progress of a training: a bar, a line of figures per check, and a picture of the loss curves."""
+"""What a training keeps on disk: checkpoints that it resumes from, bit for bit, and loss curves."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
+import os
+import zipfile
 from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from refu_core._files import MAX_JSON_BYTES, parse_json, read_file, replacing
-from refu_core.errors import RefuError
+import torch
+
+from refu_core._files import MAX_JSON_BYTES, open_file, parse_json, read_file, replacing
+from refu_core.errors import RefuError, WeightsError
+
+_MAX_BYTES = 16 << 30
+"""Weights of the paper's sizes, and the two moments of each that Adam keeps, are 8 GB."""
+
+
+def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
+    """Writes tensors and plain values; the file is never half written.
+
+    Raises `WeightsError`: the disk can't be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Through memory: on a full disk torch's own writer raises errors of its own instead of `OSError`.
+        buffer = io.BytesIO()
+        torch.save(dict(state), buffer)
+        with replacing(path, sync=True) as file:
+            file.write(buffer.getbuffer())
+    except OSError as error:
+        raise WeightsError(f"{path}: the checkpoint can't be written: {error}") from error
+
+
+def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] | None:
+    """What `save_checkpoint` wrote; None where there is nothing. No pickled code is run.
+
+    Raises:
+        RefuError: the state's "identity" is another one: the checkpoint is of another training.
+        WeightsError: the file is damaged.
+    """
+    if not os.path.lexists(path):
+        return None
+    try:
+        state = torch.load(_as_saved(path), map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises whatever its readers do
+        raise WeightsError(f"{path}: a damaged checkpoint; delete it to start anew: {error}") from error
+    if not isinstance(state, dict):
+        msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
+        raise WeightsError(msg)
+    if identity is not None and state.get("identity") != identity:
+        raise RefuError(f"{path}: of a training with other settings or data; delete it to start anew")
+    return state
+
+
+def _as_saved(path: Path) -> io.BytesIO:
+    """The archive as `torch.save` would have written it: the same records, none of them compressed.
+
+    Torch's own reader allocates whatever size a damaged record claims. So it gets an archive that was made here.
+    """
+    buffer = io.BytesIO()
+    with (
+        open_file(path, most=_MAX_BYTES, error=WeightsError, wanted="a checkpoint of refu train") as file,
+        zipfile.ZipFile(file) as archive,
+        zipfile.ZipFile(buffer, "w") as copy,
+    ):
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            msg = "it has compressed records"
+            raise zipfile.BadZipFile(msg)
+        if sum(entry.file_size for entry in entries) > file.size:
+            msg = "its records are larger than the file"
+            raise zipfile.BadZipFile(msg)
+        for entry in entries:
+            copy.writestr(entry.filename, archive.read(entry))
+    buffer.seek(0)
+    return buffer
 
 
 class TrainingLog:
@@ -20,9 +90,7 @@ class TrainingLog:
 
         Of the processes of a parallel training one `is_writer`; the others write and show nothing.
         """
-        self._lines = folder / f"{name}.jsonl"
-        self.picture = folder / f"{name}.png"
-        """Where the picture is."""
+        self._lines, self.picture = folder / f"{name}.jsonl", folder / f"{name}.png"
         self._is_writer, self._is_shown = is_writer, is_writer and not quiet
         self._bar: Any = None
         folder.mkdir(parents=True, exist_ok=True)
@@ -53,7 +121,7 @@ class TrainingLog:
             self._bar.set_postfix({k: f"{v:.2f}" for k, v in values.items()})
 
     def end(self) -> None:
-        """The stage is done: the bar is closed and the picture drawn."""
+        """Closes the bar and draws the picture."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
@@ -71,9 +139,8 @@ class TrainingLog:
             return
         figure = Figure(figsize=(4.2 * len(stages), 3.2), layout="constrained")
         FigureCanvasAgg(figure)
-        for axes, (stage, entries) in zip(
-            figure.subplots(1, len(stages), squeeze=False)[0], stages.items(), strict=True
-        ):
+        panels = figure.subplots(1, len(stages), squeeze=False)[0]
+        for axes, (stage, entries) in zip(panels, stages.items(), strict=True):
             for name in sorted({key for entry in entries for key in entry} - {"stage", "step"}):
                 points = [(entry["step"], entry[name]) for entry in entries if name in entry]
                 axes.plot(*zip(*points, strict=True), label=name, linewidth=1.4)
@@ -93,8 +160,7 @@ def _entries(path: Path) -> list[dict[str, Any]]:
     for line in lines:
         with contextlib.suppress(ValueError, RecursionError):
             entry = parse_json(line)
-            if not isinstance(entry, dict) or "step" not in entry or not isinstance(entry.get("stage"), str):
-                continue
-            if all(isinstance(value, (int, float)) for name, value in entry.items() if name != "stage"):
+            is_entry = isinstance(entry, dict) and "step" in entry and isinstance(entry.get("stage"), str)
+            if is_entry and all(isinstance(entry[name], (int, float)) for name in entry if name != "stage"):
                 entries.append(entry)
     return entries
