@@ -342,7 +342,8 @@ def test_card_counts_what_is_there(simulated: Path, samples: list[GarmentSample]
     assert card["yield"]["simulated"] == COUNT + stored["dropped"].sum()
     assert card["figures"]["stretch_p999_largest"] == pytest.approx(stored["stretch"].max())
     assert card["clips"] == {"train": ["walk"], "test": ["wave"]}
-    assert card["plan"] == asdict(SamplePlan(GARMENT, COUNT, test_share=TEST_SHARE))
+    plan = SamplePlan(GARMENT, COUNT, test_share=TEST_SHARE, postures=list(POSTURES))
+    assert card["plan"] == asdict(plan)
 
 
 def test_dataset_reads_what_was_written(
