@@ -70,8 +70,7 @@ def require_new(path: Path, count: int) -> None:
     found = path.parent.glob(glob.escape(path.name) if is_one else f"{glob.escape(path.stem)}_{number}{suffix}")
     there = next(found, None)
     if there is not None:
-        msg = f"{there} is there already: name another file, or --overwrite it"
-        raise RefuError(msg)
+        raise RefuError(f"{there} is there already: name another file, or --overwrite it")
 
 
 def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps: float = 30.0) -> list[Path]:
@@ -85,12 +84,10 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        msg = f"{path}: wanted a file of {', '.join(FORMATS)}, got {suffix or 'no suffix'}"
-        raise RefuError(msg)
+        raise RefuError(f"{path}: wanted a file of {', '.join(FORMATS)}, got {suffix or 'no suffix'}")
     count = len(meshes[0].vertices) if meshes else 0
     if not count:
-        msg = f"{path}: there is no frame to write"
-        raise RefuError(msg)
+        raise RefuError(f"{path}: there is no frame to write")
     origin = meshes[0].vertices[0].mean(0).round()
     origin *= np.abs(origin).max() > _FAR
     try:
@@ -104,8 +101,7 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
             with replacing(one) as file:
                 file.write(_glb(meshes, k, origin) if suffix == ".glb" else _obj(meshes, k))
     except OSError as error:
-        msg = f"{path}: can't be written: {error.strerror or error}"
-        raise RefuError(msg) from error
+        raise RefuError(f"{path}: can't be written: {error.strerror or error}") from error
     return paths
 
 
@@ -147,8 +143,7 @@ def export(
     warnings = [*source.warnings(pipeline), *left_out]
     if not outputs:
         why = left_out[-1]
-        msg = f"{options.input}: has no frame that can be dressed from number {first} on: {why}"
-        raise RefuError(msg)
+        raise RefuError(f"{options.input}: has no frame that can be dressed from number {first} on: {why}")
     step = 1e-9 * float(np.median(np.diff([frame.stamp_ns for frame in frames]))) if len(frames) > 1 else 0.0
     fps = round(1 / step, 3) if step > 0 else 30.0
     turn = turn_from(frames[0].up.astype(np.float64))
@@ -250,5 +245,4 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
             texture.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uv.coordinates)))
             texture.SetIndices(Vt.IntArray.FromNumpy(mesh.uv.faces.ravel().astype(np.int32)))
     if not stage.GetRootLayer().Export(str(path)):
-        msg = f"{path}: can't be written"
-        raise RefuError(msg)
+        raise RefuError(f"{path}: can't be written")

@@ -62,15 +62,12 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
     target = options.output or garments_folder() / f"{options.name or _name_of(options.mesh)}.npz"
     name = target.stem.removeprefix("garment_")
     if name in BUILTIN_GARMENTS:
-        msg = f"{name} is a garment that ships: call this one otherwise (--name)"
-        raise GarmentError(msg)
+        raise GarmentError(f"{name} is a garment that ships: call this one otherwise (--name)")
     require_name(name if options.name is None else options.name)
     if options.name not in (None, name):
-        msg = f"{target}: a garment is called as its file: leave --name out, or write {options.name}.npz"
-        raise GarmentError(msg)
+        raise GarmentError(f"{target}: a garment is called as its file: leave --name out, or write {options.name}.npz")
     if target.exists() and not options.overwrite:
-        msg = f"{target} is there already: give it another --name, or --overwrite it"
-        raise GarmentError(msg)
+        raise GarmentError(f"{target} is there already: give it another --name, or --overwrite it")
     details = GarmentDetails(
         options.layer,
         options.color or GarmentDetails().color,
@@ -83,8 +80,7 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
             surface, body, name=name, placing=placing, details=details, longest_edge=options.longest_edge
         )
     except GarmentError as error:
-        msg = f"{options.mesh}: {error}"
-        raise GarmentError(msg) from error
+        raise GarmentError(f"{options.mesh}: {error}") from error
     worn = try_on(made)
     save_garment(made.template, target)
     template = made.template
@@ -119,8 +115,7 @@ def _placing(options: AddOptions) -> Placing:
     if options.unit is not None:
         unit = UNITS.get(options.unit) or _number(options.unit)
         if not 1e-6 < unit < 1e6:
-            msg = f"no unit {options.unit!r}: wanted {', '.join(UNITS)}, or how many metres it is"
-            raise GarmentError(msg)
+            raise GarmentError(f"no unit {options.unit!r}: wanted {', '.join(UNITS)}, or how many metres it is")
     return Placing(unit, options.up, _pose(options.pose), options.as_placed)
 
 
@@ -131,8 +126,7 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
     if Path(text).suffix.lower() in SUFFIXES:
         pose = np.array(read_recording(text, error=GarmentError, fps=30.0).poses[0], np.float64).reshape(N_JOINTS, 3)
         if not np.isfinite(pose).all():
-            msg = f"{text}: its first frame isn't finite, and wanted is the pose of the mesh: cut it out"
-            raise GarmentError(msg)
+            raise GarmentError(f"{text}: its first frame isn't finite, and wanted is the pose of the mesh: cut it out")
         pose[0] = 0  # the mesh stands upright; --up gives its axes
         return pose
     angle = 0.0 if text == "t" else _number(text)

@@ -275,8 +275,7 @@ def replay(
     if not result.latencies_ms and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         reasons = reasons or "; ".join(() if source.bag is None else source.bag.reader.warnings)
-        msg = f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}"
-        raise adapters.BagError(msg)
+        raise adapters.BagError(f"{options.input}: no frame could be replayed: {reasons or 'the input is empty'}")
     return result
 
 

@@ -63,8 +63,7 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
         with replacing(page) as file:
             file.write(_page(result, frames, turned).encode())
     except OSError as error:
-        msg = f"{folder}: the report can't be written: {error.strerror or error}"
-        raise RefuError(msg) from error
+        raise RefuError(f"{folder}: the report can't be written: {error.strerror or error}") from error
     return page
 
 

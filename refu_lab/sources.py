@@ -111,8 +111,7 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
     if options.input.suffix.lower() in SUFFIXES:
         if options.topic is not None or options.input_type is not None:
             what = "--topic" if options.topic is not None else "--input-type"
-            msg = f"{options.input}: {what} is for bags, this is a file of motion"
-            raise RefuError(msg)
+            raise RefuError(f"{options.input}: {what} is for bags, this is a file of motion")
         motion = adapters.read_motion(
             options.input,
             fps=options.fps,

@@ -101,8 +101,7 @@ def _write(path: Path, text: str) -> None:
         with replacing(path) as file:
             file.write((text + "\n").encode())
     except OSError as error:
-        msg = f"{path.parent}: the results can't be written: {error.strerror or error}"
-        raise RefuError(msg) from error
+        raise RefuError(f"{path.parent}: the results can't be written: {error.strerror or error}") from error
 
 
 def replay_table(result: ReplayResult) -> str:

@@ -119,8 +119,7 @@ def _check(options: TrainOptions) -> None:
 def _numbers(joints: Sequence[str]) -> list[int]:
     unknown = [name for name in joints if name not in JOINT_NAMES]
     if unknown:
-        msg = f"no joint {printable(unknown[0])}: wanted some of {', '.join(JOINT_NAMES)}"
-        raise RefuError(msg)
+        raise RefuError(f"no joint {printable(unknown[0])}: wanted some of {', '.join(JOINT_NAMES)}")
     return [JOINT_NAMES.index(name) for name in joints]
 
 

@@ -104,8 +104,7 @@ def moments_of(bag: Path, garment: GarmentTemplate) -> list[TrueFrame]:
             if true is not None:
                 found.append((frame, true))
     if not found:
-        msg = f"{bag}: no ground truth of {garment.name} in it"
-        raise GarmentError(msg)
+        raise GarmentError(f"{bag}: no ground truth of {garment.name} in it")
     keys = [np.concatenate((one.betas, np.zeros(4) if one.style is None else one.style)) for one, _ in found]
     _, pairs = np.unique(np.round(np.stack(keys), 4), axis=0, return_inverse=True)
     return [TrueFrame(*one, int(pair)) for one, pair in zip(found, pairs.reshape(-1), strict=True)]

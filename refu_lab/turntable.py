@@ -66,8 +66,7 @@ def turntable(colours: Mapping[str, tuple[float, float, float]], frames: Sequenc
     counts = [np.shape(mesh.vertices)[:1] + np.shape(mesh.faces)[:1] for mesh in frames[0].after]
     for name, (n_vertices, _) in zip(colours, counts, strict=True):
         if n_vertices > _MOST:
-            msg = f"{name}: {n_vertices} vertices, a page shows at most {_MOST}"
-            raise RefuError(msg)
+            raise RefuError(f"{name}: {n_vertices} vertices, a page shows at most {_MOST}")
     blocks = [_signed(np.diff(np.asarray(mesh.faces).reshape(-1), prepend=0)) for mesh in frames[0].after]
     told: list[dict[str, Any]] = []
     for frame in frames:

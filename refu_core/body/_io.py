@@ -48,8 +48,7 @@ def load_body(
         msg = f"no body {str(source)!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or the path of an .npz or .pkl file"
         raise BodyError(msg)
     if path.is_dir():
-        msg = f"{path} is a folder: wanted a body model in it, as {path / 'SMPL_FEMALE.pkl'}"
-        raise BodyError(msg)
+        raise BodyError(f"{path} is a folder: wanted a body model in it, as {path / 'SMPL_FEMALE.pkl'}")
     if path.suffix.lower() not in (".npz", ".pkl"):
         msg = f"{path}: a body model must be an .npz or an official .pkl file, got {path.suffix!r}"
         if path.suffix.lower() in _MESHES:

@@ -22,8 +22,7 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     Smooth, with finite derivatives at the zero rotation. Raises `FrameError` for another shape.
     """
     if rotvec.shape[-1:] != (3,):
-        msg = f"rotation vectors must have the shape (..., 3), got {tuple(rotvec.shape)}"
-        raise FrameError(msg)
+        raise FrameError(f"rotation vectors must have the shape (..., 3), got {tuple(rotvec.shape)}")
     if is_plain(rotvec):
         flat = rotvec.reshape(-1, 3).contiguous()
         matrices = rotvec.new_empty(*rotvec.shape, 3)

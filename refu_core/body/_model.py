@@ -78,13 +78,11 @@ class BodyArrays:
             try:
                 array = np.asarray(data[key], dtype=np.float64, order="C")
             except (TypeError, ValueError, OverflowError) as error:
-                msg = f"{source}: {key} is not an array of numbers: {error}"
-                raise BodyError(msg) from error
+                raise BodyError(f"{source}: {key} is not an array of numbers: {error}") from error
             # The parent of the root is 2**32 - 1 in official files; all else is metres, shares and indices.
             largest = max(-array.min(initial=0), array.max(initial=0))  # NaN if any value is
             if not np.isfinite(largest) or (key != "kintree_table" and largest > _LARGEST):
-                msg = f"{source}: {key} has values that are NaN or infinite, or beyond {_LARGEST:g}"
-                raise BodyError(msg)
+                raise BodyError(f"{source}: {key} has values that are NaN or infinite, or beyond {_LARGEST:g}")
             return array
 
         read = {key: numbers(key) for key in ("weights", "J_regressor", "kintree_table", "posedirs") if key in data}
@@ -107,8 +105,7 @@ class BodyArrays:
         shapedirs, faces = numbers("shapedirs"), np.atleast_1d(numbers("f"))
         n_shapes = shapedirs.shape[0 if shapedirs.shape[-1] in (n, 3 * n) else -1] if shapedirs.ndim else 0
         if n_shapes < N_BETAS:
-            msg = f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}"
-            raise BodyError(msg)
+            raise BodyError(f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}")
         require("shapedirs", shapedirs, (n, 3, n_shapes))
         require("f", faces, (n_rows(faces.shape), 3))
         require("weights", read["weights"], (n, N_JOINTS))
@@ -130,8 +127,7 @@ class BodyArrays:
                 msg += ": they count from 1, wanted from 0; subtract 1"
             raise BodyError(msg)
         if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3 or arrays.weights.min() < -1e-3:
-            msg = f"{source}: the skinning weights of a vertex must sum to one, and none be negative"
-            raise BodyError(msg)
+            raise BodyError(f"{source}: the skinning weights of a vertex must sum to one, and none be negative")
         return arrays
 
 
@@ -210,8 +206,7 @@ class SmplBody:
         tensor = _tensor(name, value, self.device).to(self.dtype)
         size = int(np.prod(width))
         if tensor.shape[1:] not in (width, (size,)) or tensor.ndim < 2:
-            msg = f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}"
-            raise FrameError(msg)
+            raise FrameError(f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}")
         return tensor.reshape(-1, *width)
 
     def rest_joints(self, betas: Tensor) -> Tensor:
@@ -251,8 +246,7 @@ class SmplBody:
             return posed
         shift = _tensor("transl", transl, self.device)
         if shift.ndim != 2 or shift.shape[1] != 3 or len(shift) not in (1, batch):
-            msg = f"transl must have the shape ({batch}, 3) or (1, 3), got {tuple(shift.shape)}"
-            raise FrameError(msg)
+            raise FrameError(f"transl must have the shape ({batch}, 3) or (1, 3), got {tuple(shift.shape)}")
         return posed._replace(vertices=posed.vertices + shift[:, None], joints=posed.joints + shift[:, None])
 
     def shape(self, betas: Tensor) -> Shape:
@@ -279,5 +273,4 @@ def _tensor(name: str, value: ArrayLike | Tensor, device: torch.device) -> Tenso
     try:
         return torch.tensor(np.asarray(value), device=device)
     except (TypeError, ValueError) as error:
-        msg = f"{name} must be an array or tensor of numbers, got {type(value).__name__}"
-        raise FrameError(msg) from error
+        raise FrameError(f"{name} must be an array or tensor of numbers, got {type(value).__name__}") from error

@@ -65,8 +65,7 @@ def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
             except MeshError as error:
                 fault = f"{error}; or give it as betas_from, which needs its shapes alone"
     if fault:
-        msg = f"body {body.name}: {fault}"
-        raise BodyError(msg)
+        raise BodyError(f"body {body.name}: {fault}")
 
 
 def _loose(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:

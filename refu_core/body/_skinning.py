@@ -68,8 +68,7 @@ class Skinning:
         rotation, translation = transforms
         batch, n = len(rotation), len(self._weights)
         if points.shape not in ((batch, n, 3), (1, n, 3)):
-            msg = f"wanted points of the shape ({batch}, {n}, 3) or (1, {n}, 3), got {tuple(points.shape)}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted points of the shape ({batch}, {n}, 3) or (1, {n}, 3), got {tuple(points.shape)}")
         if not is_plain(points, rotation, translation, self._weights):
             return apply_transforms(points, blend_transforms(self._weights, transforms))
         points, stacked = points.contiguous(), _stacked(transforms)

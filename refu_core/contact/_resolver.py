@@ -127,13 +127,11 @@ class Resolver:
         distances = self._floats["distance"] if start is None else start.distance
         if points.shape != (self._n_vertices, 3) or distances.shape != (self._n_vertices,):
             shapes = f"{tuple(points.shape)} and {tuple(distances.shape)}"
-            msg = f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}")
         if self._is_serial:  # a GPU would have to be waited for
             require_finite("points", points)
         if not 0 <= margin < math.inf:
-            msg = f"wanted a margin of 0 m or more, got {margin}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted a margin of 0 m or more, got {margin}")
         if start is None and sdf is not self._last_sdf:
             msg = "nothing to go on from: the last call wasn't for this sdf; give what it says of the points as start"
             raise MeshError(msg)
@@ -147,8 +145,7 @@ class Resolver:
             if start is None:
                 self._run("go on")
             elif start.face is None:
-                msg = "start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf"
-                raise MeshError(msg)
+                raise MeshError("start must name the closest faces: ask an ExactSdf, BandSdf or ApproxSdf")
             else:
                 self._floats["first"].copy_(start.distance)
                 self._vectors["first_gradient"].copy_(start.gradient)

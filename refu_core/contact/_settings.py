@@ -73,8 +73,7 @@ class ContactSettings:
         """Raises `MeshError` for a gap that isn't positive, as rays step by it, and for numbers that aren't even."""
         if not self.gap > 0 or self.around % 2 or self.levellings % 2:
             given = f"{self.gap}, {self.around} and {self.levellings}"
-            msg = f"wanted a gap of more than 0 m, and even numbers for around and levellings, got {given}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted a gap of more than 0 m, and even numbers for around and levellings, got {given}")
 
     @property
     def tolerance(self) -> float:

@@ -159,8 +159,7 @@ class FrameStep:
         """
         if not np.isfinite(packed.sum(dtype=np.float64)):
             bad = int((~np.isfinite(packed)).any(axis=1).sum())
-            msg = f"vertices must be finite, got NaN or infinite ones of {bad} of {len(packed)} persons"
-            raise MeshError(msg)
+            raise MeshError(f"vertices must be finite, got NaN or infinite ones of {bad} of {len(packed)} persons")
         for row in torch.from_numpy(packed):
             body, skin, shift, *parts = torch.split(row, self._sizes)
             garments = {

@@ -67,13 +67,11 @@ def _templates(
         garments = [garments]
     require_type(garments, Collection, "names of garments", error=GarmentError)
     if not len(garments):
-        msg = "no garment was asked for: name at least one"
-        raise GarmentError(msg)
+        raise GarmentError("no garment was asked for: name at least one")
     loaded = [one if isinstance(one, GarmentTemplate) else load_garment(one) for one in garments]
     names = [template.name for template in loaded]
     if len(set(names)) < len(names):
-        msg = f"wanted garments of different names, got {', '.join(names)}: a person wears each once"
-        raise GarmentError(msg)
+        raise GarmentError(f"wanted garments of different names, got {', '.join(names)}: a person wears each once")
     return {template.name: template.to(device=device) for template in loaded}
 
 

@@ -160,8 +160,7 @@ class PipelineOutput(Mapping[str, GarmentMesh]):
         try:
             return self.garments[name]
         except KeyError as error:
-            msg = f"no garment {name!r}: this person wears {', '.join(self.garments)}"
-            raise KeyError(msg) from error
+            raise KeyError(f"no garment {name!r}: this person wears {', '.join(self.garments)}") from error
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles have all arrays made."""

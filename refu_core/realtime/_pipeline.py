@@ -115,8 +115,7 @@ class GarmentPipeline:
 
     def __reduce__(self) -> NoReturn:
         """Raises `RefuError`: memory that kernels work in can't be moved elsewhere."""
-        msg = "a pipeline can't be pickled or copied: load one in each process, or call one from all threads"
-        raise RefuError(msg)
+        raise RefuError("a pipeline can't be pickled or copied: load one in each process, or call one from all threads")
 
     @classmethod
     @own_settings()
@@ -174,8 +173,7 @@ class GarmentPipeline:
         _check_margin(margin)
         require_type(threads, int, "a number of threads")
         if threads < 1:
-            msg = f"wanted at least one thread, got {threads}"
-            raise RefuError(msg)
+            raise RefuError(f"wanted at least one thread, got {threads}")
         torch_device = checked_device(device)
         outfit = load_outfit(
             garments,
@@ -243,8 +241,7 @@ class GarmentPipeline:
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
         given: object = adjust
         if not callable(given):
-            msg = f"wanted a function of a Dressed, got {type(given).__name__}"
-            raise FrameError(msg)
+            raise FrameError(f"wanted a function of a Dressed, got {type(given).__name__}")
         with self._crew.turn() as step:
             return self._run(step, [frame], self.margin, adjust)[0]
 
@@ -351,8 +348,7 @@ def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:
 def _check_margin(margin: float | None) -> None:
     require_type(margin, (Real, NoneType), "a margin in metres, or None")
     if margin is not None and not 0 <= margin <= MAX_MARGIN:
-        msg = f"the margin must be between 0 and {MAX_MARGIN} m, got {margin}"
-        raise RefuError(msg)
+        raise RefuError(f"the margin must be between 0 and {MAX_MARGIN} m, got {margin}")
 
 
 def _style(value: ArrayLike, device: torch.device) -> Tensor:

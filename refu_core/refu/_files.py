@@ -46,6 +46,5 @@ def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -
             msg = f"wanted a margin of 0 to {MAX_MARGIN} m and a least scale of 0 to 1, got {got}; train it again"
             raise WeightsError(msg)
     except WeightsError as error:
-        msg = f"{weights.path}: its ReFU layer doesn't fit its card: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{weights.path}: its ReFU layer doesn't fit its card: {error}") from error
     return refu.float().to(device)

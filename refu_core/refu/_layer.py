@@ -43,12 +43,10 @@ class Refu(nn.Module):
         super().__init__()
         require_type(n_vertices, Integral, "a number of vertices", error=MeshError)
         if n_vertices < 1:
-            msg = f"wanted a garment of at least one vertex, got {n_vertices}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted a garment of at least one vertex, got {n_vertices}")
         require_type(margin, Real, "a margin in metres", error=MeshError)
         if not 0 <= margin < math.inf:
-            msg = f"wanted a margin of 0 m or more, got {margin}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted a margin of 0 m or more, got {margin}")
         self.config: dict[str, Any] = {
             "n_vertices": n_vertices,
             "least": least,
@@ -97,11 +95,9 @@ class Refu(nn.Module):
         require_type(sample, SdfSample, "an SdfSample, as the query of a signed distance gives", error=MeshError)
         batch = len(points)
         if points.shape != (batch, self.n_vertices, 3):
-            msg = f"wanted garments of the shape (B, {self.n_vertices}, 3), got {tuple(points.shape)}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted garments of the shape (B, {self.n_vertices}, 3), got {tuple(points.shape)}")
         if self.scale is not None and (z is None or len(z) != batch):
-            msg = f"wanted features z of {batch} bodies, got {None if z is None else tuple(z.shape)}"
-            raise MeshError(msg)
+            raise MeshError(f"wanted features z of {batch} bodies, got {None if z is None else tuple(z.shape)}")
         flat = SdfSample(sample.distance.reshape(-1), sample.gradient.reshape(-1, 3))
         alpha: float | Tensor = 1.0
         if self.scale is not None and z is not None:

@@ -67,8 +67,6 @@ def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: flo
         )
         raise MeshError(msg)
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
-        msg = f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}"
-        raise MeshError(msg)
+        raise MeshError(f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}")
     if not margin >= 0:
-        msg = f"the margin must not be negative, got {margin}"
-        raise MeshError(msg)
+        raise MeshError(f"the margin must not be negative, got {margin}")

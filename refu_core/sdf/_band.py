@@ -70,8 +70,7 @@ class BandSdf(MeshSdf):
         Raises `MeshError` when the faces aren't a closed, consistently oriented surface, or the band isn't positive.
         """
         if not 0 < band < math.inf:
-            msg = f"the band must be positive, got {band}"
-            raise MeshError(msg)
+            raise MeshError(f"the band must be positive, got {band}")
         super().__init__(faces)
         self.band = band
         self._tree = None if rest is None else BoxTree(self.faces, rest)
@@ -89,8 +88,7 @@ class BandSdf(MeshSdf):
         self._require_update()
         where = self._checked(points)
         if len(ring.start) - 1 != len(where):
-            msg = f"the ring is of {len(ring.start) - 1} vertices, got {len(where)}"
-            raise MeshError(msg)
+            raise MeshError(f"the ring is of {len(ring.start) - 1} vertices, got {len(where)}")
         if not len(where):
             return SdfSample(where[:, 0], where, torch.empty(0, dtype=torch.int32))
         found = self._scan(where, beyond=self.band)

@@ -29,8 +29,7 @@ class BoxTree:
         """
         n = len(faces)
         if n > MAX_FACES:
-            msg = f"a tree of boxes holds {MAX_FACES} faces, got {n}: simplify the body"
-            raise MeshError(msg)
+            raise MeshError(f"a tree of boxes holds {MAX_FACES} faces, got {n}: simplify the body")
         depth = 0
         while _WIDTH ** (depth + 1) < n:
             depth += 1

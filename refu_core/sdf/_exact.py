@@ -116,8 +116,7 @@ class ExactSdf(MeshSdf):
         Not differentiable; raises as `query`.
         """
         if not max_distance > 0:
-            msg = f"max_distance must be positive, got {max_distance}"
-            raise MeshError(msg)
+            raise MeshError(f"max_distance must be positive, got {max_distance}")
         self._require_update()
         where = self._checked(points)
         near = None if near is None else self._checked_faces(near, len(where), least=-1)

@@ -159,16 +159,14 @@ class MeshSdf(ABC):
     def _checked_faces(self, near: Tensor, n: int, *, least: int = 0) -> Tensor:
         if not isinstance(near, Tensor) or near.shape != (n,) or near.is_floating_point():
             got = f"{near.dtype} of shape {tuple(near.shape)}" if isinstance(near, Tensor) else type(near).__name__
-            msg = f"near must be integers of the shape ({n},), got {got}"
-            raise MeshError(msg)
+            raise MeshError(f"near must be integers of the shape ({n},), got {got}")
         near = near.to(device=self.device, dtype=torch.int32).contiguous()
         # Clamped, as a check would wait for the device, and no kernel may read beyond the faces.
         return near.clamp(least, len(self.faces) - 1)
 
     def _require_update(self) -> Tensor:
         if self._points is None:
-            msg = "no body yet: call update(vertices) before asking for distances"
-            raise MeshError(msg)
+            raise MeshError("no body yet: call update(vertices) before asking for distances")
         return self._points
 
 
@@ -176,8 +174,7 @@ def require_outward(vertices: Tensor, faces: Tensor) -> None:
     """Raises `MeshError` where one of B bodies (B, V, 3) [m] with these `faces`, shape (F, 3), is turned inside out."""
     a, b, c = vertices[:, faces.long()].unbind(2)
     if not bool(((a * torch.linalg.cross(b, c)).sum((1, 2)) > 0).all()):
-        msg = "the body's faces must be counter-clockwise seen from outside: this body has a negative volume"
-        raise MeshError(msg)
+        raise MeshError("the body's faces must be counter-clockwise seen from outside: this body has a negative volume")
 
 
 def require_tensor(name: str, value: object) -> None:
@@ -192,8 +189,7 @@ def require_points(points: Tensor) -> None:
     """Raises `MeshError` for what isn't a tensor of finite points, shape (N, 3)."""
     require_tensor("points", points)
     if points.ndim != 2 or points.shape[1] != 3:
-        msg = f"points must have the shape (N, 3), got {tuple(points.shape)}"
-        raise MeshError(msg)
+        raise MeshError(f"points must have the shape (N, 3), got {tuple(points.shape)}")
     require_finite("points", points)
 
 
@@ -206,8 +202,7 @@ def require_finite(name: str, values: Tensor) -> None:
     largest = float(values.detach().abs().max())  # NaN if any value is; as quick as a sum
     if not math.isfinite(largest):
         bad = int((~torch.isfinite(values)).any(dim=-1).sum())
-        msg = f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates"
-        raise MeshError(msg)
+        raise MeshError(f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates")
     if largest > _FARTHEST:
         msg = f"{name} must be within {_FARTHEST:.0e} m of the origin, got {largest:.3g} m; is the unit metres?"
         raise MeshError(msg)

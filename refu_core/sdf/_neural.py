@@ -146,8 +146,7 @@ class NeuralSdf:
         """
         del near
         if self._posed is None:
-            msg = "no body yet: call update(vertices, pose=..., betas=...) before asking for distances"
-            raise MeshError(msg)
+            raise MeshError("no body yet: call update(vertices, pose=..., betas=...) before asking for distances")
         require_points(points)
         rotation, root, betas, pose = (value.to(points) for value in self._posed)
         own = (points - root) @ rotation + root
@@ -193,10 +192,8 @@ def load_sdf_network(stem: Path, body: SmplBody) -> SdfNetwork:
     try:
         config = config_of_card(SdfNetworkConfig, weights.card.get("network"))
         if config.hidden > _MOST_LAYERS:
-            msg = f"wanted at most {_MOST_LAYERS} hidden layers, got {config.hidden}"
-            raise WeightsError(msg)
+            raise WeightsError(f"wanted at most {_MOST_LAYERS} hidden layers, got {config.hidden}")
         network = build_for(weights.tensors, lambda: SdfNetwork(config))
     except WeightsError as error:
-        msg = f"{stem}: not the weights of a distance network: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{stem}: not the weights of a distance network: {error}") from error
     return network.to(device=body.device, dtype=body.dtype)

@@ -71,11 +71,9 @@ def _as_saved(path: Path) -> io.BytesIO:
     ):
         entries = archive.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-            msg = "it has compressed records"
-            raise zipfile.BadZipFile(msg)
+            raise zipfile.BadZipFile("it has compressed records")
         if sum(entry.file_size for entry in entries) > file.size:
-            msg = "its records are larger than the file"
-            raise zipfile.BadZipFile(msg)
+            raise zipfile.BadZipFile("its records are larger than the file")
         for entry in entries:
             copy.writestr(entry.filename, archive.read(entry))
     buffer.seek(0)

@@ -31,8 +31,7 @@ def config_of_card(kind: type[Config], values: Any) -> Config:
     Raises `WeightsError` for other fields, fields of other types, and sizes that no network has.
     """
     if not isinstance(values, Mapping):
-        msg = f"wanted the fields of {kind.__name__}, got {str(values)[:80]}: train it again"
-        raise WeightsError(msg)
+        raise WeightsError(f"wanted the fields of {kind.__name__}, got {str(values)[:80]}: train it again")
     given = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
     for field in fields(kind):
         if field.name in given and not _fits(field, given[field.name]):
@@ -41,8 +40,7 @@ def config_of_card(kind: type[Config], values: Any) -> Config:
     try:
         return kind(**given)
     except TypeError as error:
-        msg = f"a card that this version doesn't know: {error}; train it again"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"a card that this version doesn't know: {error}; train it again") from error
 
 
 def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, shared: str = " ") -> Module:
@@ -64,8 +62,7 @@ def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, sha
         module = build()
         module.load_state_dict(dict(tensors), strict=False)
     except _WRONG as error:
-        msg = f"not the network that its card describes: {error}; train it again"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"not the network that its card describes: {error}; train it again") from error
     return module
 
 

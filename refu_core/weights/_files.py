@@ -77,8 +77,7 @@ def save_weights(
     if base is not None:
         loaded = load_weights(stem.with_name(base))
         if "base" in loaded.card:
-            msg = f"{stem}: wanted a base that is stored whole, got {base}; nothing was written"
-            raise WeightsError(msg)
+            raise WeightsError(f"{stem}: wanted a base that is stored whole, got {base}; nothing was written")
         differs = {"base": base, "base_sha256": loaded.card["sha256"]}
         tensors = _differences(tensors, loaded.tensors)
     data = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()})
@@ -97,8 +96,7 @@ def save_weights(
         with replacing(Path(f"{stem}.json"), sync=True) as file:
             file.write((json.dumps(full, indent=1) + "\n").encode())
     except OSError as error:
-        msg = f"{stem}: weights can't be written: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{stem}: weights can't be written: {error}") from error
     return path
 
 
@@ -113,12 +111,10 @@ def load_weights(stem: str | Path, *, expect: Mapping[str, Any] | None = None) -
         return stored
     name = stored.card["base"]
     if not isinstance(name, str) or not name or name != Path(name).name:
-        msg = f"{stored.path}: wanted a base in the same folder, got {str(name)[:80]!r}"
-        raise WeightsError(msg)
+        raise WeightsError(f"{stored.path}: wanted a base in the same folder, got {str(name)[:80]!r}")
     base = _load_stored(Path(stem).with_name(name))
     if "base" in base.card or base.card["sha256"] != stored.card.get("base_sha256"):
-        msg = f"{stored.path}: made for another {name} than the one beside it; get both files again"
-        raise WeightsError(msg)
+        raise WeightsError(f"{stored.path}: made for another {name} than the one beside it; get both files again")
     tensors = _sum(base, stored)
     _require_sense(stored.path, tensors)
     return replace(stored, tensors=tensors, files=(*base.files, *stored.files))
@@ -140,8 +136,7 @@ def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weig
 def _require_sense(path: Path, tensors: Mapping[str, Tensor]) -> None:
     bad = [name for name, t in tensors.items() if t.is_floating_point() and not bool(torch.isfinite(t).all())]
     if bad:
-        msg = f"{path}: wanted finite weights, got NaN or infinity in {', '.join(bad)}"
-        raise WeightsError(msg)
+        raise WeightsError(f"{path}: wanted finite weights, got NaN or infinity in {', '.join(bad)}")
     large = [name for name, t in tensors.items() if t.is_floating_point() and t.numel() and t.abs().max() > LARGEST]
     if large:
         msg = f"{path}: wanted weights of at most {LARGEST:g}, got larger ones in {', '.join(large)}; train it again"
@@ -184,27 +179,23 @@ def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:
         with _open(path, MAX_BYTES) as file:
             (n,) = struct.unpack("<Q", file.read(8))
             if not 2 <= n <= MAX_CARD_BYTES:  # {} at least
-                msg = f"a header of {n} bytes"
-                raise ValueError(msg)
+                raise ValueError(f"a header of {n} bytes")
             file.seek(0)
             digest = hashlib.sha256()
             while step := file.read(_PIECE):
                 digest.update(step)
             if digest.hexdigest() != sha256:
-                msg = f"{damaged}; get both files again"
-                raise WeightsError(msg)
+                raise WeightsError(f"{damaged}; get both files again")
             file.seek(0)
             tensors: dict[str, Tensor] = load(file.read())
             if not {tensor.dtype for tensor in tensors.values()} <= _DTYPES:
-                msg = "it has numbers of another type"
-                raise ValueError(msg)
+                raise ValueError("it has numbers of another type")
             return tensors
     except (SafetensorError, *DAMAGE) as error:
         if isinstance(error, WeightsError):
             raise
         what = "larger than this machine's memory" if isinstance(error, MemoryError) else "not a safetensors file"
-        msg = f"{damaged}: {what} ({error}); get both files again"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{damaged}: {what} ({error}); get both files again") from error
 
 
 def load_card(stem: str | Path) -> dict[str, Any]:
@@ -216,17 +207,14 @@ def load_card(stem: str | Path) -> dict[str, Any]:
     except (ValueError, RecursionError, OSError) as error:
         if isinstance(error, WeightsError):
             raise
-        msg = f"{path}: not a card of weights: {error}"
-        raise WeightsError(msg) from error
+        raise WeightsError(f"{path}: not a card of weights: {error}") from error
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         got = card.get("format") if isinstance(card, dict) else type(card).__name__
-        msg = f"{path}: wanted a card of the format {FORMAT}, got {got}"
-        raise WeightsError(msg)
+        raise WeightsError(f"{path}: wanted a card of the format {FORMAT}, got {got}")
     return card
 
 
 def _open(path: Path, most: int) -> InputFile:
     if not os.path.lexists(path):
-        msg = f"{path}: no such weights; train some with `refu train`"
-        raise WeightsError(msg)
+        raise WeightsError(f"{path}: no such weights; train some with `refu train`")
     return open_file(path, most=most, error=WeightsError, wanted="weights or their card, as `refu train` writes them")

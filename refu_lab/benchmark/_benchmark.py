@@ -136,8 +136,7 @@ def start_row(
         run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if run.returncode:
         last = (run.stderr.strip().splitlines() or ["no word about it"])[-1]
-        msg = f"a process that was to dress one person failed: {last}"
-        raise RefuError(msg)
+        raise RefuError(f"a process that was to dress one person failed: {last}")
     found: dict[str, float] = json.loads(run.stdout.strip().splitlines()[-1])
     ms = 1e3 * found.pop("first_mesh_cpu_s")
     return BenchmarkRow(

@@ -113,8 +113,7 @@ def in_path(text: str) -> Path:
     except UnicodeError:
         text = ""
     if not text or "\0" in text:
-        msg = "wanted a path, got nothing, or a name that no file has"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError("wanted a path, got nothing, or a name that no file has")
     return Path(text)
 
 
@@ -128,8 +127,7 @@ def _output(wanted: str, *kinds: Callable[[int], bool]) -> Callable[[str], Path]
         except FileNotFoundError:
             is_right = True
         except OSError as error:
-            msg = f"{printable(text)} can't be written: {error.strerror}"
-            raise argparse.ArgumentTypeError(msg) from error
+            raise argparse.ArgumentTypeError(f"{printable(text)} can't be written: {error.strerror}") from error
         if not is_right or not found.name:
             msg = f"wanted {wanted} to write, or a new one; {printable(text)} is something else"
             raise argparse.ArgumentTypeError(msg)
@@ -145,8 +143,7 @@ def out_picture(text: str) -> Path:
     """The path of a picture to write; with a suffix other than .png it could be some other file."""
     found = out_file(text)
     if found.suffix.lower() != ".png":
-        msg = f"wanted a name that ends in .png, got {printable(text)}"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError(f"wanted a name that ends in .png, got {printable(text)}")
     return found
 
 
@@ -166,8 +163,7 @@ def word(text: str) -> str:
     except UnicodeError:
         text = ""
     if not text.isprintable() or not text:
-        msg = "wanted text without control characters"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError("wanted text without control characters")
     return text
 
 
@@ -274,8 +270,7 @@ def require_use(args: argparse.Namespace, needed: Mapping[str, str]) -> None:
     """Raises `RefuError` for an option given without the one it depends on; `needed` maps the former to the latter."""
     for name, other in needed.items():
         if getattr(args, name) is not None and not getattr(args, other):
-            msg = f"--{name.replace('_', '-')} is of no use without --{other}: give both, or leave it out"
-            raise RefuError(msg)
+            raise RefuError(f"--{name.replace('_', '-')} is of no use without --{other}: give both, or leave it out")
 
 
 def check_writable(path: Path) -> None:
@@ -287,11 +282,9 @@ def check_writable(path: Path) -> None:
     while not folder.exists():
         folder = folder.parent
     if not folder.is_dir() or not os.access(folder, os.W_OK):
-        msg = f"{path}: can't be written, {folder} is not a writable folder"
-        raise RefuError(msg)
+        raise RefuError(f"{path}: can't be written, {folder} is not a writable folder")
     if path.is_file() and not os.access(path, os.W_OK):
-        msg = f"{path}: can't be written over, it is read-only; name another place"
-        raise RefuError(msg)
+        raise RefuError(f"{path}: can't be written over, it is read-only; name another place")
 
 
 def require_distinct(written: Mapping[str, Path]) -> None:
@@ -300,16 +293,14 @@ def require_distinct(written: Mapping[str, Path]) -> None:
     for option, path in written.items():
         other = places.setdefault(os.path.realpath(path), option)
         if other != option:
-            msg = f"{path}: both {other} and {option} would be written there; name two places"
-            raise RefuError(msg)
+            raise RefuError(f"{path}: both {other} and {option} would be written there; name two places")
 
 
 def require_apart(given: Path, written: Path) -> None:
     """Raises `RefuError` if the output `written` is the input `given`, or one of them lies in the other."""
     here, there = (Path(os.path.realpath(path)) for path in (given, written))  # also for links that go in a circle
     if here == there or there in here.parents or here in there.parents:
-        msg = f"{written}: would be written over the input {given}; name another place"
-        raise RefuError(msg)
+        raise RefuError(f"{written}: would be written over the input {given}; name another place")
 
 
 def tell(args: argparse.Namespace, text: str, content: dict[str, Any], *, code: int = 0) -> int:

@@ -75,11 +75,9 @@ class BenchmarkOptions:
         """Raises `RefuError` for options with which nothing can be measured."""
         unknown = [name for name in self.garments or () if name not in PAPER_GARMENTS]
         if unknown:
-            msg = f"no garment {unknown[0]!r}: wanted some of {', '.join(PAPER_GARMENTS)}"
-            raise RefuError(msg)
+            raise RefuError(f"no garment {unknown[0]!r}: wanted some of {', '.join(PAPER_GARMENTS)}")
         if self.device not in (None, "cpu", "cuda"):
-            msg = f"no device {self.device!r}: wanted cpu or cuda"
-            raise RefuError(msg)
+            raise RefuError(f"no device {self.device!r}: wanted cpu or cuda")
         if self.weights is not None and not self.weights.is_dir():
             msg = f"{self.weights}: not a folder; wanted one with a folder a garment, as refu train writes them"
             raise RefuError(msg)

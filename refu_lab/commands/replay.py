@@ -111,8 +111,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.report is not None:
         if args.evaluate is False:
-            msg = "a report is of evaluated frames: leave out --report or --no-evaluate"
-            raise RefuError(msg)
+            raise RefuError("a report is of evaluated frames: leave out --report or --no-evaluate")
         page = Path(args.report) / "index.html"
         if not args.overwrite and page.is_file() and f"<title>{REPLAY_TITLE}".encode() not in page.read_bytes():
             msg = f"{page}: is there already, and no report of refu replay; name another folder, or --overwrite it"

@@ -74,8 +74,7 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.simulate import simulate, simulation_table
 
     if args.sequences and args.postures:
-        msg = "--postures are for poses at rest: leave --sequences out"
-        raise RefuError(msg)
+        raise RefuError("--postures are for poses at rest: leave --sequences out")
     cli.require_use(args, {"shapes": "sequences", "seconds": "sequences", "input_axes": "motions", "fps": "motions"})
     if find_spec("numba") is None:  # said before the work begins, which imports it
         raise ModuleNotFoundError(name="numba")

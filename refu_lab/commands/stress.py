@@ -41,11 +41,9 @@ class StressOptions:
     def __post_init__(self) -> None:
         unknown = [part for part in self.parts if part not in PARTS]
         if unknown:
-            msg = f"no part {unknown[0]!r}: wanted {', '.join(PARTS)}"
-            raise SettingsError(msg)
+            raise SettingsError(f"no part {unknown[0]!r}: wanted {', '.join(PARTS)}")
         if self.hours is not None and not 0 < self.hours < math.inf:
-            msg = f"hours must be above zero, got {self.hours:g}"
-            raise SettingsError(msg)
+            raise SettingsError(f"hours must be above zero, got {self.hours:g}")
 
     @property
     def modes(self) -> Sequence[tuple[str, str]]:

@@ -46,8 +46,7 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
     Raises `FleetError`: Dask isn't installed, both were asked for, or there is no scheduler at the address.
     """
     if jobs is not None and scheduler is not None:
-        msg = "wanted either processes of this machine (--jobs) or a cluster (--scheduler), got both"
-        raise FleetError(msg)
+        raise FleetError("wanted either processes of this machine (--jobs) or a cluster (--scheduler), got both")
     if scheduler is None and (jobs is None or jobs == 1):
         yield InProcess()
         return
@@ -176,8 +175,7 @@ def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) ->
     with contextlib.suppress(OSError):
         os.chdir(folder)
     if version != __version__:
-        msg = f"a worker has refu-ros {__version__}, this is {version}: install one version everywhere"
-        raise FleetError(msg)
+        raise FleetError(f"a worker has refu-ros {__version__}, this is {version}: install one version everywhere")
     if digest not in _made:
         _made.clear()
         make = pickle.loads(packed)

@@ -73,8 +73,7 @@ def find_data_sets(inputs: Sequence[str]) -> list[Path]:
         is_glob = _MAGIC.search(text) and not Path(text).exists()
         paths = [Path(match) for match in sorted(glob.glob(text))] if is_glob else [Path(text)]  # noqa: PTH207
         if not paths:
-            msg = f"{text}: nothing there; wanted folders of data sets"
-            raise RefuError(msg)
+            raise RefuError(f"{text}: nothing there; wanted folders of data sets")
         for path in paths:
             inner = sorted(card.parent for card in path.glob("*/card.json")) if path.is_dir() else []
             found += [path] if (path / "card.json").exists() or not inner else inner
@@ -94,8 +93,7 @@ def _find(text: str) -> Iterator[str]:
             for match in sorted(map(str, fs.glob(path))) if _MAGIC.search(path) else [path]:
                 yield from map(fs.unstrip_protocol, _walk(fs.walk(match), match) if fs.isdir(match) else [match])
         except OSError as error:
-            msg = f"{text}: can't be listed: {error}"
-            raise RefuError(msg) from error
+            raise RefuError(f"{text}: can't be listed: {error}") from error
         return
     is_glob = _MAGIC.search(text) and not Path(text).exists()
     for match in sorted(glob.glob(text, recursive=True)) if is_glob else [text]:  # noqa: PTH207  (from anywhere)

@@ -35,8 +35,7 @@ def filesystem(place: str) -> tuple[Any, str]:
     try:
         fs, path = fsspec.url_to_fs(place)
     except (ImportError, ValueError) as error:
-        msg = f"{place}: {error}"
-        raise RefuError(msg) from error
+        raise RefuError(f"{place}: {error}") from error
     return fs, str(path)
 
 
@@ -52,8 +51,7 @@ def fetched(source: str) -> Iterator[Path]:
         try:
             fs.get(path, str(here), recursive=fs.isdir(path))
         except OSError as error:
-            msg = f"{source}: can't be read: {error}"
-            raise RefuError(msg) from error
+            raise RefuError(f"{source}: can't be read: {error}") from error
         yield here
 
 
@@ -156,5 +154,4 @@ class Folder:
         try:
             yield
         except OSError as error:
-            msg = f"{self.place}: can't be written: {error.strerror or error}"
-            raise RefuError(msg) from error
+            raise RefuError(f"{self.place}: can't be written: {error.strerror or error}") from error

@@ -54,20 +54,16 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     """
     if not options.data and (options.table not in ("all", "motion") or options.motions is None):
         need = "--motions DIR" if options.table == "motion" else "--data DIR"
-        msg = f"nothing to evaluate: the table {options.table} needs {need}"
-        raise RefuError(msg)
+        raise RefuError(f"nothing to evaluate: the table {options.table} needs {need}")
     page = options.output / "README.md"
     if page.exists() and not is_summary(page):
-        msg = f"{page}: is there already, and no page of refu evaluate; name another folder with --output"
-        raise RefuError(msg)
+        raise RefuError(f"{page}: is there already, and no page of refu evaluate; name another folder with --output")
     sets = [SampleSet.open(path) for path in options.data]
     kinds = [(samples.garment, samples.shapes) for samples in sets]
     if twice := [name for name, n in Counter(kinds).items() if n > 1]:
-        msg = f"wanted one data set a garment, got several of {twice[0][0]}"
-        raise RefuError(msg)
+        raise RefuError(f"wanted one data set a garment, got several of {twice[0][0]}")
     if unknown := [shapes for _, shapes in kinds if shapes not in (None, *SEQUENCE_SHAPES)]:
-        msg = f"wanted sequences of {' or '.join(map(str, SEQUENCE_SHAPES))} body shapes, got {unknown[0]}"
-        raise RefuError(msg)
+        raise RefuError(f"wanted sequences of {' or '.join(map(str, SEQUENCE_SHAPES))} body shapes, got {unknown[0]}")
     posed = [samples for samples in sets if samples.shapes is None]
     moving = [samples for samples in sets if samples.shapes is not None]
     has_data = {name: bool(posed) for name in RESULT_TABLES}
@@ -76,8 +72,7 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     if not wanted:
         kind = "sequences (refu simulate --sequences)" if options.table == "sequence" else "poses"
         need = "--motions DIR" if options.table == "motion" else f"a data set of {kind} in --data"
-        msg = f"the table {options.table} needs {need}"
-        raise RefuError(msg)
+        raise RefuError(f"the table {options.table} needs {need}")
     library = Library(options.weights, collider=options.collider, body=options.body)
     how: dict[str, Any] = {"library": library, "progress": progress}
     output, n_posed = options.output, {samples.garment: len(samples) for samples in posed}
@@ -143,6 +138,5 @@ def read_clips(folder: Path) -> dict[str, adapters.Motion]:
     """A folder's AMASS-style motions, by name. Raises `RefuError`: there is no motion, or one can't be read."""
     paths = sorted(folder.glob("*.npz"))
     if not paths:
-        msg = f"{folder}: no motion in it, wanted AMASS-style .npz files"
-        raise RefuError(msg)
+        raise RefuError(f"{folder}: no motion in it, wanted AMASS-style .npz files")
     return {path.stem: adapters.read_motion(path) for path in paths}

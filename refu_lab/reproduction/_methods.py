@@ -165,8 +165,7 @@ class Library:
         for folder in (weights_folder(garment, root) for root in (*self._folders, None)):
             if (folder / f"{name}.json").exists():
                 return folder / name
-        msg = "not trained"
-        raise WeightsError(msg)
+        raise WeightsError("not trained")
 
     def load(self, method: Method, garment: str) -> Wearable:
         """A method's networks. Raises `WeightsError` if they are missing, damaged or for another body."""

@@ -101,8 +101,7 @@ class Predictor:
         self._refu: Refu | None = None
         if method.handling == "refu":
             if worn.refu is None:
-                msg = f"{method.weights}: weights of a backbone alone, wanted those of one with ReFU"
-                raise WeightsError(msg)
+                raise WeightsError(f"{method.weights}: weights of a backbone alone, wanted those of one with ReFU")
             self._refu = _with_margin(worn.refu, method.margin)
         self._name = setup.template.name
         self._outfit = Outfit(setup.body, {self._name: replace(worn, refu=self._refu)}, setup.collider)

@@ -78,8 +78,7 @@ class SampleSet:
         dataset = open_dataset(path)
         samples = _of_sequences(dataset) if isinstance(dataset, GarmentSequences) else _of_poses(dataset)
         if not samples.count:
-            msg = f"{path}: no test sample in it is finished yet"
-            raise RefuError(msg)
+            raise RefuError(f"{path}: no test sample in it is finished yet")
         return samples
 
 
@@ -96,8 +95,7 @@ def _of_poses(dataset: GarmentDataset) -> SampleSet:
 def _of_bag(path: Path) -> SampleSet:
     names = garments_of(path)
     if len(names) != 1:
-        msg = f"{path}: wanted the ground truth of one garment, got {', '.join(names) or 'none'}"
-        raise RefuError(msg)
+        raise RefuError(f"{path}: wanted the ground truth of one garment, got {', '.join(names) or 'none'}")
     moments = moments_of(path, load_garment(names[0]))
 
     def read(number: int) -> Sample:
@@ -220,8 +218,7 @@ def run_methods(
         for index, part in (engine or InProcess()).run(partial(_runner, *prepared), _Blocks(samples)):
             if isinstance(part, Lost) or part.keys() != ready.keys():
                 why = part.reason if isinstance(part, Lost) else "a process hasn't the weights that this one has"
-                msg = f"{garment}: samples {index * _BLOCK} and following are lost: {why}"
-                raise RefuError(msg)
+                raise RefuError(f"{garment}: samples {index * _BLOCK} and following are lost: {why}")
             parts[index] = part
             bar.update(len(next(iter(part.values()))))
     for name in ready:

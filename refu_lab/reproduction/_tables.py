@@ -253,8 +253,7 @@ def read_table(folder: Path, name: str) -> ResultTable | None:
         missing = [Missing(**one) for one in data["missing"]]
         return ResultTable(data["table"], data["title"], data["about"], rows, missing, plots)
     except (ValueError, KeyError, TypeError) as error:
-        msg = f"{path}: not results of refu evaluate ({error!r}): remove it, or make it again"
-        raise RefuError(msg) from error
+        raise RefuError(f"{path}: not results of refu evaluate ({error!r}): remove it, or make it again") from error
 
 
 def is_summary(page: Path) -> bool:
@@ -262,8 +261,7 @@ def is_summary(page: Path) -> bool:
     try:
         return _SUMMARY in page.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        msg = f"{page}: can't be read: {error.strerror}"
-        raise RefuError(msg) from error
+        raise RefuError(f"{page}: can't be read: {error.strerror}") from error
 
 
 def write_summary(folder: Path) -> Path:

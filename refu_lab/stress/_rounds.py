@@ -227,8 +227,7 @@ def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
             else:
                 left_out.append(f"{name}: no weights of {backbone} {sdf}")
     if not worn:
-        msg = f"nothing to try: {'; '.join(left_out) or 'no garment was named'}"
-        raise StressError(msg)
+        raise StressError(f"nothing to try: {'; '.join(left_out) or 'no garment was named'}")
     found = [Wardrobe(garments=tuple(names), backbone=b, sdf=sdf) for (b, sdf, _), names in worn.items()]
     return found, left_out
 
@@ -274,8 +273,7 @@ def replay_trial(path: Path, *, weights: Path | None = None, collider: bool = Tr
     """
     name, wardrobe, trial = load_trial(path)
     if name not in CHECKS:
-        msg = f"{path}: of the check {name!r}, which this version doesn't have"
-        raise StressError(msg)
+        raise StressError(f"{path}: of the check {name!r}, which this version doesn't have")
     tally = Tally(name, wardrobe.mode)
     with one_thread():
         tally.add(wardrobe, trial, CHECKS[name].run(Subject(wardrobe, weights=weights, collider=collider), trial))

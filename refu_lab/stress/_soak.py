@@ -92,8 +92,7 @@ def soak(
     """
     calls = -(-frames // persons)
     if calls < _FEWEST:
-        msg = f"a soak needs {_FEWEST} frames or more of each person, got {calls}"
-        raise StressError(msg)
+        raise StressError(f"a soak needs {_FEWEST} frames or more of each person, got {calls}")
     steps = list(zip(*(soak_frames(np.random.default_rng(seed + i)) for i in range(persons)), strict=True))
     for step in steps:  # what the very first frames allocate isn't growth
         pipeline(step)

@@ -308,8 +308,7 @@ def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
     data = read_npz(path, keys=_KEYS, error=StressError, wanted="a trial that refu stress has written")
     missing = [key for key in _KEYS if key not in data]
     if missing:
-        msg = f"{path}: not a trial that refu stress has written, it lacks {', '.join(missing)}"
-        raise StressError(msg)
+        raise StressError(f"{path}: not a trial that refu stress has written, it lacks {', '.join(missing)}")
     garments = tuple(map(str, np.atleast_1d(data["garments"])))
     wardrobe = Wardrobe(garments=garments, backbone=str(data["backbone"]), sdf=str(data["sdf"]))
     try:
@@ -317,5 +316,4 @@ def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
         frames = tuple(SmplFrame(p, b, t, style=style if has_style else None) for p, b, t, style, has_style in columns)
         return str(data["check"]), wardrobe, Trial(frames, int(data["seed"]))
     except (RefuError, TypeError, ValueError) as error:
-        msg = f"{path}: its frames can't be used: {error}"
-        raise StressError(msg) from error
+        raise StressError(f"{path}: its frames can't be used: {error}") from error

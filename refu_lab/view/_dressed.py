@@ -174,8 +174,7 @@ class DressedFilm:
         if n_bad:
             self.notes.append(f"{options.input}: {n_bad} messages are no frame and are left out")
         if not frames:
-            msg = f"{options.input}: no frame that can be shown"
-            raise RefuError(msg)
+            raise RefuError(f"{options.input}: no frame that can be shown")
         return sorted(frames, key=lambda frame: frame.stamp_ns)
 
 

@@ -88,8 +88,7 @@ def _play(
 def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | RecordedFilm | LiveFilm:
     """The film of the inputs: a bag of garments is shown as it is, motion is dressed. Raises `RefuError`."""
     if (options.live is None) == (not options.inputs):
-        msg = "wanted either recordings to look at or --live, for a node that runs"
-        raise RefuError(msg)
+        raise RefuError("wanted either recordings to look at or --live, for a node that runs")
     if options.live is not None:
         return LiveFilm(options.live or TOPICS)
     from refu_lab.view._dressed import DressedFilm
@@ -99,8 +98,7 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
     names_motion = options.dressing.topic is not None or options.dressing.input_type is not None
     if not (options.dress or names_motion or first.suffix.lower() in SUFFIXES) and has_meshes(first):
         if len(options.inputs) > 1:
-            msg = f"{first}: has garments, and is shown alone; --dress dresses the motion of several"
-            raise RefuError(msg)
+            raise RefuError(f"{first}: has garments, and is shown alone; --dress dresses the motion of several")
         return RecordedFilm(first, progress=progress)
     return DressedFilm(options.inputs, options.dressing)
 
