@@ -167,8 +167,9 @@ def draw_collider() -> None:
 
 
 def draw_postures() -> None:
-    """Everyday postures, dressed; rows of nine."""
-    rows = [collider_sheet(poses=tuple(POSTURES)[i : i + 9], size=(170, 210), samples=4)[-210:] for i in (0, 9)]
+    """Everyday postures, dressed; rows of seven."""
+    names, size = tuple(POSTURES), (200, 210)
+    rows = [collider_sheet(poses=names[i : i + 7], size=size, samples=4)[-210:] for i in range(0, len(names), 7)]
     save_jpeg(np.concatenate(rows), "postures")
 
 

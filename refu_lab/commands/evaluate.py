@@ -41,7 +41,7 @@ def add(commands: Any) -> None:
         nargs="+",
         default=[],
         metavar="DIR",
-        help="data sets of refu simulate or bags with ground truth, one a garment, or folders and globs of them",
+        help="data sets of refu simulate or bags with ground truth, or folders and globs of them",
     )
     cli.add_options(parser, EvaluateOptions)
     parser.add_argument(

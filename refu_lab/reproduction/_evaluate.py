@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -58,11 +57,8 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     page = options.output / "README.md"
     if page.exists() and not is_summary(page):
         raise RefuError(f"{page}: is there already, and no page of refu evaluate; name another folder with --output")
-    sets = [SampleSet.open(path) for path in options.data]
-    kinds = [(samples.garment, samples.shapes) for samples in sets]
-    if twice := [name for name, n in Counter(kinds).items() if n > 1]:
-        raise RefuError(f"wanted one data set a garment, got several of {twice[0][0]}")
-    if unknown := [shapes for _, shapes in kinds if shapes not in (None, *SEQUENCE_SHAPES)]:
+    sets = SampleSet.joined([SampleSet.open(path) for path in options.data])
+    if unknown := [samples.shapes for samples in sets if samples.shapes not in (None, *SEQUENCE_SHAPES)]:
         raise RefuError(f"wanted sequences of {' or '.join(map(str, SEQUENCE_SHAPES))} body shapes, got {unknown[0]}")
     posed = [samples for samples in sets if samples.shapes is None]
     moving = [samples for samples in sets if samples.shapes is not None]

@@ -67,6 +67,18 @@ class SampleSet:
         return replace(self, count=len(rows), read=lambda number: self.read(int(rows[number])))
 
     @classmethod
+    def joined(cls, sets: Sequence[SampleSet]) -> list[SampleSet]:
+        """The sets, those of one garment and kind joined to one."""
+        groups: dict[tuple[str, int | None], list[SampleSet]] = {}
+        for one in sets:
+            groups.setdefault((one.garment, one.shapes), []).append(one)
+        found = []
+        for (garment, shapes), group in groups.items():
+            places = [(one, row) for one in group for row in range(len(one))]
+            found.append(cls(garment, len(places), shapes, partial(_read, places)))
+        return found
+
+    @classmethod
     def open(cls, path: Path) -> SampleSet:
         """The test samples finished so far of the set in the folder `path`, or the samples of a bag with ground truth.
 
@@ -80,6 +92,11 @@ class SampleSet:
         if not samples.count:
             raise RefuError(f"{path}: no test sample in it is finished yet")
         return samples
+
+
+def _read(places: Sequence[tuple[SampleSet, int]], number: int) -> Sample:
+    samples, row = places[number]
+    return samples.read(row)
 
 
 def _of_poses(dataset: GarmentDataset) -> SampleSet:

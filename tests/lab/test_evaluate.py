@@ -257,8 +257,16 @@ def test_a_page_of_somebody_else_stays(dataset: Path, tmp_path: Path, capsys: py
     assert (tmp_path / "README.md").read_text() == "# My robot\n"
 
 
-def test_two_sets_of_one_garment_are_refused(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("--data", dataset, dataset, "--output", tmp_path / "out") == 2
-    assert "one data set a garment" in capsys.readouterr().err
+def test_sets_of_one_garment_are_evaluated_as_one(dataset: Path) -> None:
+    alone, bag = SampleSet.open(dataset), SampleSet.open(BAGS / "eval_skirt_female")
+    (both, other) = SampleSet.joined([alone, bag, alone])
+    assert (both.garment, len(both), len(other)) == (alone.garment, 2 * len(alone), len(bag))
+    for row in range(len(both)):
+        np.testing.assert_array_equal(both.read(row).vertices, alone.read(row % len(alone)).vertices)
+
+
+def test_a_table_without_samples_of_its_kind_is_refused(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("--data", dataset, "--table", "sequence", "--output", tmp_path / "out") == 2
     assert "needs a data set of sequences" in capsys.readouterr().err
