@@ -110,15 +110,20 @@ class Press:
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
         self._meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
-        close = self._launches(fabric, garment.edge_length)
-        wide = close if knows_arms else self._launches(fabric, settings.limb_reach)
-        self._commands = {True: close, False: wide}
+        edge = garment.edge_length
+        self._commands = {
+            False: self._launches(fabric, edge if knows_arms else settings.limb_reach, settings.limb_reach),
+            True: self._launches(fabric, edge, settings.gap),
+        }
 
-    def _launches(self, fabric: Any, beside: float) -> dict[str, Any]:
-        """The recorded steps, by name, for cloth that feels limbs up to `beside` [m] to its side."""
+    def _launches(self, fabric: Any, beside: float, low: float) -> dict[str, Any]:
+        """The recorded steps, by name, for cloth that feels limbs up to `beside` [m] to its side.
+
+        Cloth near its skin feels them from less far: twice its height squared, divided by `low` [m].
+        """
         settings, meshes, n = self._settings, self._meshes, len(self._points)
         feel = kernels.Feel()
-        feel.room, feel.lies, feel.beside = settings.gap, settings.limb_reach, beside
+        feel.room, feel.lies, feel.beside, feel.low = settings.gap, settings.limb_reach, beside, low
         sweeps, near = settings.around, settings.near
         launches: dict[str, tuple[Any, int, list[Any]]] = {
             "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, feel]),

@@ -18,6 +18,7 @@ class Feel:
 
     room: wp.float32
     beside: wp.float32
+    low: wp.float32
     lies: wp.float32
 
 
@@ -54,7 +55,7 @@ class Fabric:
 @wp.func
 def beside(height: float, feel: Feel) -> float:
     """How far to the side of a limb cloth at this height feels it [m]."""
-    return wp.min(feel.beside, 2.0 * height * height / feel.lies)
+    return wp.min(feel.beside, 2.0 * height * height / feel.low)
 
 
 @wp.kernel

@@ -185,8 +185,8 @@ class ContactStage:
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         numbers, kept = done.numbers, margin
         drawn = self.press(name, done.vertices, was_pushed=True)
-        if drawn is not done.vertices:
-            pressed = pressed + (drawn - done.vertices)
+        was_drawn = drawn is not done.vertices
+        if was_drawn:
             done = resolver(drawn, self.sdf, None, margin=margin)
         if worn:
             vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
@@ -201,7 +201,7 @@ class ContactStage:
         vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
         if self._is_tight:
             vertices = self._off_skin[name].parted(vertices)
-        if was_torn or worn or self._is_tight:  # No single step goes farther than this; together they may.
+        if was_drawn or was_torn or worn or self._is_tight:  # No single step goes farther than this; together they may.
             vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
         if self.way_out is not None:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)

@@ -90,7 +90,7 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool, was_pushed: bool) -
         h, whole = height[v], height[v] + how.gap
         if not (is_asked[v] and how.gap < h < 2 * how.limb_reach):
             continue
-        aside = min(farthest, 2 * h * h / how.limb_reach)
+        aside = min(farthest, 2 * h * h / (how.gap if was_pushed else how.limb_reach))
         least = whole
         for triangles in arms:
             go = 0.0
