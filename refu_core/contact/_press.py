@@ -110,20 +110,21 @@ class Press:
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
         self._meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
-        edge = garment.edge_length
         self._commands = {
-            False: self._launches(fabric, edge if knows_arms else settings.limb_reach, settings.limb_reach),
-            True: self._launches(fabric, edge, settings.gap),
+            False: self._launches(
+                fabric, garment.edge_length if knows_arms else settings.limb_reach, settings.gap, 0.0
+            ),
+            True: self._launches(fabric, settings.gap, settings.gap / 2, settings.tolerance),
         }
 
-    def _launches(self, fabric: Any, beside: float, low: float) -> dict[str, Any]:
-        """The recorded steps, by name, for cloth that feels limbs up to `beside` [m] to its side.
+    def _launches(self, fabric: Any, beside: float, room: float, slack: float) -> dict[str, Any]:
+        """The recorded steps, by name: cloth feels limbs up to `beside` [m] to its side, and stays `room` [m] off.
 
-        Cloth near its skin feels them from less far: twice its height squared, divided by `low` [m].
+        What has to be drawn back by less than the `slack` [m] stays.
         """
         settings, meshes, n = self._settings, self._meshes, len(self._points)
         feel = kernels.Feel()
-        feel.room, feel.lies, feel.beside, feel.low = settings.gap, settings.limb_reach, beside, low
+        feel.room, feel.lies, feel.beside, feel.slack = room, settings.limb_reach, beside, slack
         sweeps, near = settings.around, settings.near
         launches: dict[str, tuple[Any, int, list[Any]]] = {
             "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, feel]),
@@ -140,8 +141,8 @@ class Press:
     def __call__(self, points: Tensor, skin: Tensor, *, was_pushed: bool = False) -> Tensor:
         """The garment (N, 3) [m], pressed by the limbs to the `skin` (N, 3) [m] that it lies on.
 
-        Once it `was_pushed` off the body, only limbs within an edge length to its side count. Where no limb comes
-        between, a CPU returns the very same points.
+        Once it `was_pushed` off the body, only limbs that are right between count, within `gap`. Where none is, a
+        CPU returns the very same points.
         """
         commands = self._commands[was_pushed]
         self._points.copy_(points)

@@ -17,8 +17,8 @@ class Feel:
     """The `ContactSettings` that the kernels read."""
 
     room: wp.float32
+    slack: wp.float32
     beside: wp.float32
-    low: wp.float32
     lies: wp.float32
 
 
@@ -55,7 +55,7 @@ class Fabric:
 @wp.func
 def beside(height: float, feel: Feel) -> float:
     """How far to the side of a limb cloth at this height feels it [m]."""
-    return wp.min(feel.beside, 2.0 * height * height / feel.low)
+    return wp.min(feel.beside, 2.0 * height * height / feel.lies)
 
 
 @wp.kernel
@@ -125,7 +125,7 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
         # Cloth at the skin has nothing to give, and cloth far off doesn't lie on this skin.
         lies = wp.clamp(2.0 - height / feel.lies, 0.0, 1.0)
         lies *= wp.clamp(height / feel.room - 1.0, 0.0, 1.0)
-        cut = lies * (height - wp.max(least - feel.room, 0.5 * least))
+        cut = lies * (height - wp.max(least - feel.room, 0.5 * least)) - feel.slack
         if cut > 0.0:
             fabric.cut[v] = cut
             fabric.rows[wp.atomic_add(fabric.counts, PRESSED, 1)] = v

@@ -81,16 +81,19 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool, was_pushed: bool) -
     to_skin = cKDTree(outfit().body.v_template.numpy()).query(rest)[0]
     is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.limb_reach)
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
-    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms or was_pushed else how.limb_reach
+    farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.limb_reach
+    room, slack = how.gap, 0.0
+    if was_pushed:
+        farthest, room, slack = how.gap, how.gap / 2, how.tolerance
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
     arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
     wanted = x.copy()
     for v in near:
-        h, whole = height[v], height[v] + how.gap
-        if not (is_asked[v] and how.gap < h < 2 * how.limb_reach):
+        h, whole = height[v], height[v] + room
+        if not (is_asked[v] and room < h < 2 * how.limb_reach):
             continue
-        aside = min(farthest, 2 * h * h / (how.gap if was_pushed else how.limb_reach))
+        aside = min(farthest, 2 * h * h / how.limb_reach)
         least = whole
         for triangles in arms:
             go = 0.0
@@ -98,11 +101,11 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool, was_pushed: bool) -
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]
                 off = min(off, aside * (least - go) / (whole - go))
                 least = min(least, go + (whole - go) * off / aside)
-                go += max(off, how.gap)
+                go += max(off, room)
         lies = np.clip(2 - h / how.limb_reach, 0, 1)
-        lies *= np.clip(h / how.gap - 1, 0, 1)
-        cut = max(lies * (h - max(least - how.gap, least / 2)), 0)
-        wanted[v] += (max(h - cut, how.gap / 2) / h - 1) * (x[v] - at[v])
+        lies *= np.clip(h / room - 1, 0, 1)
+        cut = max(lies * (h - max(least - room, least / 2)) - slack, 0)
+        wanted[v] += (max(h - cut, room / 2) / h - 1) * (x[v] - at[v])
     assert 20 < (np.abs(wanted - x) > 1e-5).any(axis=1).sum() < len(x) / 3
     np.testing.assert_allclose(pressed[near], wanted[near], atol=1e-5)
 
