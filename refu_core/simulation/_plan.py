@@ -85,6 +85,7 @@ class SamplePlan:
         if not is_listed or not all(isinstance(name, str) and name in POSTURES for name in self.postures):
             known = f"{', '.join(POSTURES)[:160]}…"
             raise SimulationError(f"wanted names of postures, from {known}, got {str(self.postures)[:80]}")
+        object.__setattr__(self, "postures", list(self.postures))  # as a card has it
         of_poses = self.recorded_share, self.posture_share
         if not (0 <= self.test_share < 1 and min(of_poses) >= 0 and sum(of_poses) <= 1 and self.spread > 0):
             wanted = "shares must lie in [0, 1), those of poses sum up to 1 at most, and the spread be above 0"
