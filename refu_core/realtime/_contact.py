@@ -184,13 +184,12 @@ class ContactStage:
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         numbers, kept = done.numbers, margin
-        drawn = self.press(name, done.vertices, was_pushed=True)
-        was_drawn = drawn is not done.vertices
-        if was_drawn:
-            done = resolver(drawn, self.sdf, None, margin=margin)
+        vertices = self.press(name, done.vertices, was_pushed=True)
+        was_drawn = vertices is not done.vertices
         if worn:
-            vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
+            vertices, _ = self.lift(name, vertices, worn, goes_on=True)
             kept = self._settings.layer_margin * margin
+        if worn or was_drawn:
             done = resolver(vertices, self.sdf, None, margin=kept)
         vertices = self._strain[name](done.vertices, raw, rest)
         was_torn = vertices is not done.vertices
