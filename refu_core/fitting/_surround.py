@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -34,7 +37,8 @@ _ACROSS = 0.5
 """Least cosine between the normal of cloth that lies along the skin and the way off the skin."""
 
 
-class Fit(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Fit:
     """How well a mesh surrounds a body, lengths in metres."""
 
     inside: float
@@ -45,8 +49,13 @@ class Fit(NamedTuple):
     """Mean distance outside, at most 60 cm."""
     facing: float
     """Share of it that faces away from the body; half of a mesh that stands beside the body does not."""
-    around: float
-    """Area of the skin that it surrounds, as a share of its own; zero if it stands beside the body."""
+    surrounded: Callable[[], float]
+    """Computes `around`, which takes longer than all else."""
+
+    @cached_property
+    def around(self) -> float:
+        """Area of the skin that it surrounds, as a share of its own; zero if it stands beside the body."""
+        return self.surrounded()
 
     @property
     def cost(self) -> float:
@@ -59,16 +68,13 @@ class Fit(NamedTuple):
 
         A gown or a poncho is far off, but has much of the body in it: a shirt that hangs on a hand has not.
         """
-        if self.distance < NEAR:
-            is_on = self.around > 0 and self.facing > _FACES
-        else:
-            is_on = self.around > _WIDE and self.facing > _WIDE_FACES
-        return self.inside < 0.05 and is_on
+        least, faces = (0, _FACES) if self.distance < NEAR else (_WIDE, _WIDE_FACES)
+        return self.inside < 0.05 and self.facing > faces and self.around > least
 
     @property
     def is_near(self) -> bool:
         """Whether it has some of the body in it, or lies near it, and doesn't stand beside it."""
-        return self.around > 0 or self.distance < 2 * NEAR
+        return self.distance < 2 * NEAR or self.around > 0
 
     @property
     def is_ring(self) -> bool:
@@ -83,7 +89,7 @@ class Fit(NamedTuple):
     @property
     def is_plain(self) -> bool:
         """Whether nothing else need be tried."""
-        return self.is_good and self.facing > _PLAINLY_FACES
+        return self.facing > _PLAINLY_FACES and self.is_good
 
 
 class Samples(NamedTuple):
@@ -132,28 +138,30 @@ def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
     n_facing = votes.max(0).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
     facing = float(n_facing / len(points))
     depth = np.clip(0.01 - distance, 0, 0.05)
-    around = _around(points, samples, outward > 0, body)
-    return Fit(
-        float((distance < -0.01).mean()), float(depth.mean()), float(np.clip(distance, 0, 0.6).mean()), facing, around
-    )
+    inside, off = float((distance < -0.01).mean()), float(np.clip(distance, 0, 0.6).mean())
+    around = partial(_around, points, samples, outward > 0, body.vertices.numpy(), body.skin)
+    return Fit(inside, float(depth.mean()), off, facing, around)
 
 
-def _around(points: F64, samples: Samples, is_outer: NDArray[np.bool_], body: PosedBody) -> float:
+def _around(
+    points: F64, samples: Samples, is_outer: NDArray[np.bool_], skin: NDArray[np.float32], skin_area: F64
+) -> float:
     """Area of the skin where the samples' winding number is above 0.4, as a share of the samples' area.
 
-    The inner side of a piece with two sides isn't counted: the two would cancel.
+    `skin` (V, 3) [m] are the body's vertices, `skin_area` (V,) [m²] what each stands for. The inner side of a piece
+    with two sides isn't counted: the two would cancel.
     """
     counts = samples.is_open | is_outer
     # A share of skin in whole vertices doesn't depend on a seventh digit, and single precision takes half the time.
     places, normals, area = (array[counts].astype(np.float32) for array in (points, samples.normals, samples.area))
-    each = max(1, len(body.vertices) // _N_SKIN)
-    skin = body.vertices.numpy()[::each]
+    each = max(1, len(skin) // _N_SKIN)
+    skin = skin[::each]
     # For each vertex and sample: the way from one to the other along the normal, and its length, squared.
     along = (places * normals).sum(1) - skin @ normals.T
     squared = np.maximum((places**2).sum(1) + (skin**2).sum(1)[:, None] - 2 * skin @ places.T, 1e-6)
     squared *= np.sqrt(squared)  # six times as fast as the power 1.5
     winding = (along / squared) @ area / (4 * np.pi)
-    return float(each * body.skin[::each][np.abs(winding) > 0.4].sum() / area.sum())
+    return float(each * skin_area[::each][np.abs(winding) > 0.4].sum() / area.sum())
 
 
 def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
