@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from refu_core.body import DEFAULT_GAP, Collider, SmplBody
+from refu_core.body import DEFAULT_GAP, Collider, ColliderSettings, SmplBody
 from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
@@ -196,7 +196,7 @@ class Draper:
         # each drape, on a mesh that depends on the drape alone, and never in between.
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
-        self._collider = Collider(body, gap=self.settings.gap)
+        self._collider = Collider(body, settings=ColliderSettings(gap=self.settings.gap))
         counts = [garment.n_vertices for garment in self.outfit.garments]
         piece = np.repeat(np.arange(len(counts)), counts)
         self.cloth = SimulatedCloth(self.topology, sdf, piece=piece, settings=self.settings.cloth)
