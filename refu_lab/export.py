@@ -181,8 +181,7 @@ def _glb(meshes: Sequence[ExportMesh], frame: int, origin: NDArray[np.float64]) 
             node_name=mesh.name,
             transform=trimesh.transformations.translation_matrix(origin),
         )
-    data: bytes = scene.export(file_type="glb")
-    return data
+    return scene.export(file_type="glb")
 
 
 def _obj(meshes: Sequence[ExportMesh], frame: int) -> bytes:

@@ -123,8 +123,7 @@ class BodyFit:
         """`values` of the body's vertices (N, …), interpolated at the vertices of the built-in mesh (V, …)."""
         place = self.registration.place
         faces = self.body.faces.cpu().numpy()
-        there: Array = np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
-        return there
+        return np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
 
     def directions(self) -> Array:
         """What a unit of each beta does to the built-in mesh on this body [m], shape (V, 3, 10)."""

@@ -47,5 +47,4 @@ class RootTurn:
 
     def to_host(self, points: Tensor) -> NDArray[np.float32]:
         """The same, as an array on the host."""
-        seen: NDArray[np.float32] = self(points).cpu().numpy()
-        return seen
+        return self(points).cpu().numpy()

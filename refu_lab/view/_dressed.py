@@ -76,8 +76,7 @@ class DressedFilm:
     @property
     def times(self) -> NDArray[np.float64]:
         """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
-        times: NDArray[np.float64] = self._moments - self._moments[0]
-        return times
+        return self._moments - self._moments[0]
 
     @property
     def front(self) -> float:
