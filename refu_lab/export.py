@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 import glob
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from refu_core import GarmentPipeline, PipelineOutput
 from refu_core._files import replacing
 from refu_core.errors import RefuError
+from refu_core.garments import UvMap
 from refu_core.history import PoseHistory
 from refu_core.recordings import turn_from
+from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from os import PathLike
-
-    from numpy.typing import NDArray
-
-    from refu_core import GarmentPipeline, PipelineOutput
-    from refu_core.garments import UvMap
-    from refu_lab.commands.replay import RecordingOptions
 
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
 """Suffixes of the files that can be written."""

@@ -14,21 +14,17 @@ a body and a garment in about two seconds. The same input gives the same picture
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from refu_core._files import replacing
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from refu_core.metrics import Collisions
+from refu_core.metrics import Collisions
 
 SKIN = (0.86, 0.70, 0.61)
 """sRGB colour that suits a body."""

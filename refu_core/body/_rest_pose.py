@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refu_core.body._kinematics import JOINT_NAMES
+from refu_core.body._model import BodyArrays, SmplBody
 from refu_core.body._segments import SOFTNESS, segment_of_face, shares
 from refu_core.errors import BodyError, MeshError
 from refu_core.mesh import Connectivity
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.body._model import BodyArrays, SmplBody
 
 _TALL = (0.3, 2.2)
 """Least and greatest distance from ankles to neck [m]: children and giants."""

@@ -8,22 +8,20 @@ import os
 import socket
 import sys
 import webbrowser
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from refu_core import RefuError
 from refu_core._device import one_thread
 from refu_core.recordings import SUFFIXES
+from refu_lab.commands.view import ViewOptions
+from refu_lab.view._dressed import DressedFilm
 from refu_lab.view._live import TOPICS, LiveFilm
+from refu_lab.view._recorded import RecordedFilm
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import viser
-
-    from refu_lab.commands.view import ViewOptions
-    from refu_lab.view._dressed import DressedFilm
-    from refu_lab.view._recorded import RecordedFilm
 
 DEFAULT_PORT = 8080
 _PORTS = 20
