@@ -189,7 +189,7 @@ def face_normals(v: NDArray[_Float], f: NDArray[np.integer[Any]]) -> NDArray[_Fl
     return np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
 
 
-def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:
+def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.integer[Any]]) -> NDArray[_Float]:
     """Unit normals at vertices (V, 3) of faces (F, 3): the area-weighted mean of faces around each, shape (V, 3)."""
     normals = np.zeros_like(vertices)
     np.add.at(normals, faces, face_normals(vertices, faces)[:, None])

@@ -29,12 +29,7 @@ class PostProcess:
 
     @torch.no_grad()
     def optimise(
-        self,
-        points: Tensor,
-        ask: Callable[[Tensor], SdfSample],
-        *,
-        clearance: float = _CLEARANCE,
-        reach: float = 0.0,
+        self, points: Tensor, ask: Callable[[Tensor], SdfSample], *, clearance: float = _CLEARANCE, reach: float = 0.0
     ) -> Tensor:
         """The optimisation of DRAPE (Guan et al. 2012), the paper's "Opt. Post-Process": garment vertices [m], (N, 3).
 

@@ -23,6 +23,7 @@ from refu_core.history import PoseHistory
 from refu_core.recordings import turn_from
 from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN
+from refu_lab.sources import open_source
 
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
 """Suffixes of the files that can be written."""
@@ -110,8 +111,6 @@ def export(
     the input's axes are, y is up in the files. Raises `RefuError`: as `write_meshes`; a file that is there already,
     unless `overwrite`; options that make no pipeline, an input that can't be read, or no frame.
     """
-    from refu_lab.sources import open_source
-
     if path.suffix.lower() not in FORMATS:  # raises before the work is done
         write_meshes((), path)
     if not overwrite:

@@ -109,11 +109,7 @@ class ReplayResult:
     """The body that wore the garments, and how well the built-in mesh fits it (`body_facts`)."""
 
     def add(
-        self,
-        frame: SmplFrame,
-        output: PipelineOutput,
-        latency_ms: float,
-        garments: Mapping[str, GarmentRecord] | None,
+        self, frame: SmplFrame, output: PipelineOutput, latency_ms: float, garments: Mapping[str, GarmentRecord] | None
     ) -> None:
         """Takes in a frame and, where it was evaluated, what was found of its `garments`."""
         shift = output.stats.shift

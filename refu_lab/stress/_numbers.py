@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core.mesh import face_normals
 from refu_core.sdf import ExactSdf
 from refu_lab.stress._trial import Measurement, Subject, Trial, distance_to_mesh, predicted
 
@@ -81,10 +82,10 @@ def _mixed(vertices: F32, faces: I64, weights: F64) -> F64:
 def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     """Points half-way between the skin and the skin opposite, where the gradient flips."""
     chosen = faces[rng.integers(len(faces), size=_POINTS)]
-    a, b, c = vertices[chosen].astype(np.float64).transpose(1, 0, 2)
-    inward = -np.cross(b - a, c - a)
+    exact = vertices.astype(np.float64)
+    inward = -face_normals(exact, chosen)
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
-    start = (a + b + c) / 3
+    start = exact[chosen].mean(1)
     sdf = ExactSdf(faces)
     sdf.update(torch.from_numpy(vertices))
     # Bisect for the depth at which another part of the skin becomes as near as the part above.

@@ -18,7 +18,7 @@ from refu_core.recordings import SUFFIXES
 from refu_lab.commands.view import ViewOptions
 from refu_lab.view._dressed import DressedFilm
 from refu_lab.view._live import TOPICS, LiveFilm
-from refu_lab.view._recorded import RecordedFilm
+from refu_lab.view._recorded import RecordedFilm, has_meshes
 
 if TYPE_CHECKING:
     import viser
@@ -43,8 +43,6 @@ def view(
     if find_spec("viser") is None:
         msg = 'the viewer needs viser: pip install "refu-ros[view]"'
         raise RefuError(msg)
-    from refu_lab.view._dressed import DressedFilm
-
     film = open_film(options, progress=progress)
     with contextlib.ExitStack() as opened:
         if not isinstance(film, DressedFilm):
@@ -89,9 +87,6 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
         raise RefuError("wanted either recordings to look at or --live, for a node that runs")
     if options.live is not None:
         return LiveFilm(options.live or TOPICS)
-    from refu_lab.view._dressed import DressedFilm
-    from refu_lab.view._recorded import RecordedFilm, has_meshes
-
     first = options.inputs[0]
     names_motion = options.dressing.topic is not None or options.dressing.input_type is not None
     if not (options.dress or names_motion or first.suffix.lower() in SUFFIXES) and has_meshes(first):
