@@ -204,8 +204,7 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, Vt
     except ImportError as error:
-        msg = f'{path}: to write USD, install its library: pip install "refu-ros[usd]" (usd-core)'
-        raise RefuError(msg) from error
+        raise RefuError(f'{path}: to write USD, install its library: pip install "refu-ros[usd]" (usd-core)') from error
     stage: Any = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)

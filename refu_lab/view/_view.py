@@ -41,8 +41,7 @@ def view(
     Raises `RefuError` for inputs that can't be shown, for a port that is taken, and if viser isn't installed.
     """
     if find_spec("viser") is None:
-        msg = 'the viewer needs viser: pip install "refu-ros[view]"'
-        raise RefuError(msg)
+        raise RefuError('the viewer needs viser: pip install "refu-ros[view]"')
     film = open_film(options, progress=progress)
     with contextlib.ExitStack() as opened:
         if not isinstance(film, DressedFilm):
