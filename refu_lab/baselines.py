@@ -16,7 +16,7 @@ from refu_core.sdf import SdfSample
 
 DRAPE_ROUNDS: tuple[tuple[float, float], ...] = ((4.0, 0.8), (2.0, 0.6), (1.0, 0.4))
 """(λ_s, λ_d) of each round of Guan et al. 2012."""
-_CLEARANCE = 0.001
+_CLEARANCE = 0.001  # [m]
 
 
 class PostProcess:

@@ -24,7 +24,7 @@ _DISTANCE_UNIT = 0.01
 """g reads distances in cm, so that they are about as large as the latent vector that it reads with them."""
 _SHARPNESS = 20.0
 """Of the softplus that keeps α in its range. α starts at 1.03 (least 1) or 1.00 (least 0), with a steep derivative."""
-_MAX_SCALE = 100.0
+_MAX_SCALE = 100.0  # greatest α
 
 
 @dataclass(frozen=True)

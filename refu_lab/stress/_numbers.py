@@ -17,7 +17,7 @@ ROUNDING = 5e-6
 COLLIDER_ROUNDING = 2e-5
 """The same with the collider [m], which divides short distances between two surfaces. It holds in everyday poses only:
 where joints turn as in no real body, rounding may decide which of two sides is nearer."""
-_DISTANCE_ROUNDING = 2e-6
+_DISTANCE_ROUNDING = 2e-6  # [m], relative beyond a metre
 _POINTS = 24
 _UNIT = 1e-3
 """How far the length of a gradient may be from one."""
