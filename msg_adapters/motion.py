@@ -129,7 +129,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
 
 
 MARCH_FPS = 30.0
-_STEPS_S = 1.2
+_STEPS_S = 1.2  # of one step
 _ROOT_HEIGHT_M = 1.156  # of the built-in male body's root above its soles
 
 

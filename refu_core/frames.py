@@ -30,7 +30,7 @@ MAX_COEFFICIENT = 100.0
 long, and a signed distance that searches around it centimetre by centimetre would never end."""
 PLAUSIBLE_ANGLE = 1e3
 """[rad]"""
-PLAUSIBLE_COEFFICIENT = 20.0
+PLAUSIBLE_COEFFICIENT = 20.0  # standard deviations
 PLAUSIBLE_TRANSL = 1e9
 """[m]"""
 

@@ -71,8 +71,7 @@ class Connectivity:
     @property
     def boundary(self) -> NDArray[np.int32]:
         """The edges that have only one face, shape (B, 2)."""
-        boundary: NDArray[np.int32] = self.edges[self.n_faces_of_edge == 1]
-        return boundary
+        return self.edges[self.n_faces_of_edge == 1]
 
     @cached_property
     def ring(self) -> Adjacency:
@@ -190,12 +189,11 @@ def face_normals(v: NDArray[_Float], f: NDArray[np.integer[Any]]) -> NDArray[_Fl
     return np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
 
 
-def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.int32]) -> NDArray[_Float]:
+def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.integer[Any]]) -> NDArray[_Float]:
     """Unit normals at vertices (V, 3) of faces (F, 3): the area-weighted mean of faces around each, shape (V, 3)."""
     normals = np.zeros_like(vertices)
     np.add.at(normals, faces, face_normals(vertices, faces)[:, None])
-    unit: NDArray[_Float] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    return unit
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def vertex_areas(vertices: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]]) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from refu_core.sdf import SdfSample
 
 DRAPE_ROUNDS: tuple[tuple[float, float], ...] = ((4.0, 0.8), (2.0, 0.6), (1.0, 0.4))
 """(λ_s, λ_d) of each round of Guan et al. 2012."""
-_CLEARANCE = 0.001
+_CLEARANCE = 0.001  # [m]
 
 
 class PostProcess:
@@ -29,12 +29,7 @@ class PostProcess:
 
     @torch.no_grad()
     def optimise(
-        self,
-        points: Tensor,
-        ask: Callable[[Tensor], SdfSample],
-        *,
-        clearance: float = _CLEARANCE,
-        reach: float = 0.0,
+        self, points: Tensor, ask: Callable[[Tensor], SdfSample], *, clearance: float = _CLEARANCE, reach: float = 0.0
     ) -> Tensor:
         """The optimisation of DRAPE (Guan et al. 2012), the paper's "Opt. Post-Process": garment vertices [m], (N, 3).
 

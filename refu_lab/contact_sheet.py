@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.body import Collider, load_body
+from refu_core.body import Collider, ColliderSettings, load_body
 from refu_core.garments import load_garment
 from refu_core.simulation import GarmentDataset, SimulationError, colliders
 from refu_lab.render import Backdrop, RenderMesh, Viewpoint, render
@@ -38,7 +38,7 @@ def contact_sheet(
     if model.fingerprint != dataset.card["body_fingerprint"]:
         msg = f"the set was made for the body {dataset.card['body']!r}, got {model.name!r}: name its file as `body`"
         raise SimulationError(msg)
-    collider = Collider(model, gap=dataset.card["settings"]["drape"]["gap"])
+    collider = Collider(model, settings=ColliderSettings(gap=dataset.card["settings"]["drape"]["gap"]))
     tiles = []
     for index in np.random.default_rng(seed).permutation(len(dataset))[:count]:
         sample = dataset.sample(int(index))

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import msg_adapters as adapters
+from msg_adapters import FrameRecord
 from msg_adapters.diagnostics import ERROR, OK, WARN
 from msg_adapters.markers import SKIN
+from refu_core import GarmentPipeline, SmplFrame
+from refu_core.realtime import PipelineOutput
+from refu_lab.commands.replay import ReplayOptions
+from refu_lab.sources import Source
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from msg_adapters import FrameRecord
-    from refu_core import GarmentPipeline, SmplFrame
-    from refu_core.realtime import PipelineOutput
-    from refu_lab.commands.replay import ReplayOptions
     from refu_lab.replay import GarmentRecord
-    from refu_lab.sources import Source
 
 GARMENTS_TOPIC, BODY_TOPIC, DIAGNOSTICS_TOPIC = "/garments", "/body", "/diagnostics"
 _LAST_STAMP_NS = 2**31 * 10**9 - 1

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import glob
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from refu_core import GarmentPipeline, PipelineOutput
 from refu_core._files import replacing
 from refu_core.errors import RefuError
+from refu_core.garments import UvMap
 from refu_core.history import PoseHistory
 from refu_core.recordings import turn_from
+from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from os import PathLike
-
-    from numpy.typing import NDArray
-
-    from refu_core import GarmentPipeline, PipelineOutput
-    from refu_core.garments import UvMap
-    from refu_lab.commands.replay import RecordingOptions
+from refu_lab.sources import open_source
 
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
 """Suffixes of the files that can be written."""
@@ -114,8 +111,6 @@ def export(
     the input's axes are, y is up in the files. Raises `RefuError`: as `write_meshes`; a file that is there already,
     unless `overwrite`; options that make no pipeline, an input that can't be read, or no frame.
     """
-    from refu_lab.sources import open_source
-
     if path.suffix.lower() not in FORMATS:  # raises before the work is done
         write_meshes((), path)
     if not overwrite:
@@ -181,8 +176,7 @@ def _glb(meshes: Sequence[ExportMesh], frame: int, origin: NDArray[np.float64]) 
             node_name=mesh.name,
             transform=trimesh.transformations.translation_matrix(origin),
         )
-    data: bytes = scene.export(file_type="glb")
-    return data
+    return scene.export(file_type="glb")
 
 
 def _obj(meshes: Sequence[ExportMesh], frame: int) -> bytes:
@@ -210,8 +204,7 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, Vt
     except ImportError as error:
-        msg = f'{path}: to write USD, install its library: pip install "refu-ros[usd]" (usd-core)'
-        raise RefuError(msg) from error
+        raise RefuError(f'{path}: to write USD, install its library: pip install "refu-ros[usd]" (usd-core)') from error
     stage: Any = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)

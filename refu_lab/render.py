@@ -14,21 +14,20 @@ a body and a garment in about two seconds. The same input gives the same picture
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from refu_core._files import replacing
-
-if TYPE_CHECKING:
-    import os
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from refu_core.metrics import Collisions
+from refu_core.mesh import face_normals, vertex_normals
+from refu_core.metrics import Collisions
+from refu_lab import _ray_kernels as shading
 
 SKIN = (0.86, 0.70, 0.61)
 """sRGB colour that suits a body."""
@@ -57,13 +56,7 @@ class Viewpoint:
 
     @classmethod
     def looking_at(
-        cls,
-        target: ArrayLike,
-        *,
-        distance: float,
-        yaw: float = 20.0,
-        pitch: float = 8.0,
-        vertical_fov: float = 26.0,
+        cls, target: ArrayLike, *, distance: float, yaw: float = 20.0, pitch: float = 8.0, vertical_fov: float = 26.0
     ) -> Viewpoint:
         """A camera `distance` metres from `target` [m], shape (3,), in front (+z) of it.
 
@@ -163,19 +156,15 @@ def render(
     `size` is width and height [pixels]. `samples` is the rays a pixel, rounded down to a square number: more make
     smoother outlines.
     """
-    import warp as wp
-
-    from refu_lab import _ray_kernels as shading
-
     (width, height), backdrop = size, backdrop or Backdrop()
     vertices, faces = _joined(meshes)
     colours = [np.broadcast_to(_to_linear(one.colour), np.shape(one.vertices)) for one in meshes]
-    corner_normals, vertex_normals = _normals(vertices, faces)
+    corner_normals, smooth = _normals(vertices, faces)
     right, up, forward = camera.axes()
     to_sun = _unit(np.asarray(backdrop.to_sun, dtype=np.float64))
     faces_wp = _array(faces.ravel(), wp.int32)
     mesh = wp.Mesh(_array(vertices, wp.vec3), faces_wp)
-    sun, sky = _light(mesh, vertices, vertex_normals, to_sun)
+    sun, sky = _light(mesh, vertices, smooth, to_sun)
     on_vertices = [_array(_uncovered(x, sky < _COVERED, faces), wp.float32) for x in (sun, sky)]
     low, high = vertices.min(0), vertices.max(0)
     ground_y = float(low[1]) if backdrop.ground_height is None else backdrop.ground_height
@@ -235,8 +224,6 @@ def sky_light(meshes: Sequence[RenderMesh]) -> list[NDArray[np.float32]]:
 
     Covered vertices take the share of their uncovered neighbours, as in a picture.
     """
-    import warp as wp
-
     vertices, faces = _joined(meshes)
     mesh = wp.Mesh(_array(vertices, wp.vec3), _array(faces.ravel(), wp.int32))
     _, sky = _light(mesh, vertices, _normals(vertices, faces)[1], np.array([0.0, 1.0, 0.0]), sun_rays=1)
@@ -260,14 +247,10 @@ def _joined(meshes: Sequence[RenderMesh]) -> tuple[NDArray[np.float32], NDArray[
 
 
 def _array(value: ArrayLike, dtype: Any) -> Any:
-    import warp as wp
-
     return wp.array(np.ascontiguousarray(value), dtype=dtype, device="cpu")
 
 
 def _vec3(value: ArrayLike) -> Any:
-    import warp as wp
-
     return wp.vec3(*(float(x) for x in np.asarray(value)))
 
 
@@ -280,14 +263,10 @@ def _light(
     sun_rays: int = _SUN_RAYS,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Shares of the sun and the sky that N points (N, 3) of these normals see past a Warp mesh, each of shape (N,)."""
-    import warp as wp
-
-    from refu_lab._ray_kernels import light_kernel
-
     sun, sky = (wp.zeros(len(points), dtype=wp.float32, device="cpu") for _ in range(2))
     rays = [_vec3(to_sun), _SUN_SPREAD, sun_rays, _SKY_RAYS, _SKY_REACH]
     inputs = [mesh.id, _array(points, wp.vec3), _array(normals, wp.vec3), *rays]
-    wp.launch(light_kernel, dim=len(points), inputs=inputs, outputs=[sun, sky], device="cpu")
+    wp.launch(shading.light_kernel, dim=len(points), inputs=inputs, outputs=[sun, sky], device="cpu")
     return sun.numpy(), sky.numpy()
 
 
@@ -295,13 +274,8 @@ def _normals(
     vertices: NDArray[np.float32], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Unit normals of face corners, (F, 3, 3), smooth except across creases, and of vertices, (V, 3)."""
-    a, b, c = (vertices[faces[:, k]].astype(np.float64) for k in range(3))
-    area = np.cross(b - a, c - a)
-    flat = _unit(area)
-    summed = np.zeros(vertices.shape)
-    for k in range(3):
-        summed[:, k] = np.bincount(faces.ravel(), np.repeat(area[:, k], 3), len(vertices))
-    smooth = _unit(summed)
+    exact = vertices.astype(np.float64)
+    flat, smooth = _unit(face_normals(exact, faces)), vertex_normals(exact, faces)
     corners = smooth[faces]
     sharp = np.einsum("fck,fk->fc", corners, flat) < _CREASE
     corners[sharp] = np.broadcast_to(flat[:, None], corners.shape)[sharp]
@@ -327,8 +301,7 @@ def _uncovered(light: NDArray[np.float32], covered: NDArray[np.bool_], faces: ND
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    result: NDArray[np.float64] = vectors / np.maximum(length, 1e-30)
-    return result
+    return vectors / np.maximum(length, 1e-30)
 
 
 def _to_linear(srgb: ArrayLike) -> NDArray[np.float64]:

@@ -35,8 +35,8 @@ When = Literal["before", "after"]
 """Before or after collision handling."""
 _MAX_REASONS = 20
 """Most reasons for skipping that are counted separately."""
-_LONGEST_PAUSE_S = 60.0
-_TOLD_S = 0.2
+_LONGEST_PAUSE_S = 60.0  # of a recording's pauses; longer ones are skipped
+_TOLD_S = 0.2  # between two reports of progress
 
 
 class Findings(NamedTuple):
@@ -109,11 +109,7 @@ class ReplayResult:
     """The body that wore the garments, and how well the built-in mesh fits it (`body_facts`)."""
 
     def add(
-        self,
-        frame: SmplFrame,
-        output: PipelineOutput,
-        latency_ms: float,
-        garments: Mapping[str, GarmentRecord] | None,
+        self, frame: SmplFrame, output: PipelineOutput, latency_ms: float, garments: Mapping[str, GarmentRecord] | None
     ) -> None:
         """Takes in a frame and, where it was evaluated, what was found of its `garments`."""
         shift = output.stats.shift

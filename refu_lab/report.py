@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from refu_core import RefuError
+from refu_core import GarmentPipeline, RefuError
 from refu_core._files import replacing
 from refu_core.metrics import CollisionChecker
 from refu_core.recordings import upright_turn
@@ -22,12 +24,7 @@ from refu_lab.turntable import STYLE as TURNTABLE_STYLE
 from refu_lab.turntable import Frame, turntable
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from matplotlib.axes import Axes
-    from numpy.typing import NDArray
-
-    from refu_core import GarmentPipeline
 
 _PICTURE = (420, 640)
 STYLE = """

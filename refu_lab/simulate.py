@@ -11,14 +11,7 @@ from tqdm import tqdm
 
 from refu_core._engine import Engine
 from refu_core.errors import SimulationError
-from refu_core.simulation import (
-    GarmentDataset,
-    Progress,
-    SamplePlan,
-    load_clips,
-    simulate_dataset,
-    simulate_sequences,
-)
+from refu_core.simulation import GarmentDataset, Progress, SamplePlan, load_clips, simulate_dataset, simulate_sequences
 from refu_lab.commands.simulate import SimulateOptions
 from refu_lab.contact_sheet import contact_sheet
 from refu_lab.render import save_png

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import msg_adapters as adapters
+from msg_adapters import FrameRecord
 from msg_adapters.axes import WORLD_FRAME, up_of
 from msg_adapters.inputs import body_of
-from refu_core import FrameError, RefuError
+from refu_core import FrameError, GarmentPipeline, RefuError, SmplBody, SmplFrame
+from refu_core.body import BodyFit
 from refu_core.history import PoseHistory
 from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
 from refu_core.recordings import GENDERS, SUFFIXES, upright_turn
 from refu_lab.commands.replay import RecordingOptions
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from msg_adapters import FrameRecord
-    from refu_core import GarmentPipeline, SmplBody, SmplFrame
-    from refu_core.body import BodyFit
 
 INPUT_TOPIC = f"/{adapters.SMPL_TOPIC}"
 _SHOWN = 8

@@ -239,8 +239,7 @@ class BagJob:
                     said = line.decode(errors="replace").strip() or said
             code = self._process.wait()
             with contextlib.suppress(OSError, ValueError):
-                result: dict[str, Any] = json.loads(self._result.read_bytes())
-                return result
+                return json.loads(self._result.read_bytes())
         if code in (_INTERRUPTED, -signal.SIGTERM):
             said = "cancelled before a frame was done"
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))

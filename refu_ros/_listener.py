@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,20 +16,18 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 import msg_adapters as adapters
 from msg_adapters.axes import up_of_sender
+from msg_adapters.scene import Scene
 from refu_core import FrameError, RefuError
 from refu_core.errors import printable
 from refu_core.keypoints import MOST_PEOPLE
 from refu_ros._guard import LOG_PERIOD_S
 from refu_ros._interfaces import interface, ros_qos
+from refu_ros._settings import NodeSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from msg_adapters.scene import Scene
     from refu_core import SmplBody, SmplFrame
     from refu_core.outputs import PinholeCamera
     from refu_ros._node import GarmentNode
-    from refu_ros._settings import NodeSettings
 
 INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=5)
 _HUMANS = re.compile(r"/humans/bodies/([A-Za-z][A-Za-z0-9_]{0,99})/joint_states")

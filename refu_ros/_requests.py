@@ -13,6 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future as RosFuture
@@ -26,8 +27,6 @@ from refu_ros._guard import answer_no
 from refu_ros._interfaces import interface
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from refu_core.realtime import PipelineOutput
     from refu_ros._node import GarmentNode
 

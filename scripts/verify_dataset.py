@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from refu_core.body import Collider, load_body
+from refu_core.body import Collider, ColliderSettings, load_body
 from refu_core.garments import load_garment
 from refu_core.simulation import colliders
 from refu_core.simulation._drape import COMFORT_POSES
@@ -80,7 +80,7 @@ class Judge:
     def __init__(self, garment: str, body: str, gap: float, most_stretch: float) -> None:
         self._garment = JoinedGarments([load_garment(name) for name in garment.split("+")]).joined
         self._body = load_body(body)
-        self._collider = Collider(self._body, gap=gap)
+        self._collider = Collider(self._body, settings=ColliderSettings(gap=gap))
         self._faces = self._garment.faces.numpy().astype(np.int64)
         self._body_faces = self._body.faces.numpy().astype(np.int64)
         self._edges = self._garment.mesh.edges

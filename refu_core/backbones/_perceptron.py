@@ -91,8 +91,7 @@ class Perceptron(_Standardised):
         for layer in hidden:
             x = self.activation(layer(x))
             x = functional.dropout(x, self.dropout) if self.training else x
-        out: Tensor = last(x)
-        return out
+        return last(x)
 
 
 class StackedPerceptrons(_Standardised):

@@ -286,5 +286,4 @@ def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArra
         means = np.zeros_like(normals)
         np.add.at(means, ring.owner, normals[ring.items])
         normals = 0.5 * (normals + means / np.diff(ring.start)[:, None])
-    unit: NDArray[np.float64] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return unit
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

@@ -12,10 +12,12 @@ from torch import Tensor
 from refu_core._warp import IN_ROW, Repeated, as_warp, is_plain, recorded, refit, strips, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
-from refu_core.body._anatomy import DEFAULT_GAP, Anatomy, ColliderSettings
+from refu_core.body._anatomy import Anatomy, ColliderSettings
 from refu_core.body._collider_gradient import part_with_gradient
 from refu_core.body._kinematics import PARENTS, RigidTransforms
 from refu_core.body._model import SmplBody
+
+_DEFAULT = ColliderSettings()
 
 
 class Collider:
@@ -35,22 +37,16 @@ class Collider:
     Make one call at a time: memory is reused from call to call.
     """
 
-    def __init__(self, body: SmplBody, *, gap: float = DEFAULT_GAP, settings: ColliderSettings | None = None) -> None:
+    def __init__(self, body: SmplBody, *, settings: ColliderSettings = _DEFAULT) -> None:
         """Prepares for a body, on its device, in a tenth of a second.
 
         Raises `MeshError` for a body that isn't a closed, consistently oriented surface.
         """
-        self.settings = ColliderSettings(gap=gap) if settings is None else settings
-        self.anatomy = Anatomy(body, self.settings)
+        self.settings, self.anatomy = settings, Anatomy(body, settings)
         self.device = body.device
         self._is_serial = body.device.type == "cpu"
-        most = _HELD * self.settings.aside_farthest, as_warp((_HELD * self.anatomy.farthest).float(), wp.float32)
+        most = _HELD * settings.aside_farthest, as_warp((_HELD * self.anatomy.farthest).float(), wp.float32)
         self._shift = Repeated(kernels.shift_kernel, (wp.vec3, wp.vec3, wp.vec3, wp.int32, wp.float32), most)
-
-    @property
-    def gap(self) -> float:
-        """Room that is left between two parts [m]."""
-        return self.settings.gap
 
     def __call__(self, skin: Tensor, transforms: RigidTransforms) -> Tensor:
         """The bodies `skin` [m], shape (B, V, 3), pulled apart, in the same axes.
@@ -112,8 +108,7 @@ class Collider:
     def _parted(self) -> Tensor:
         """The buffer that holds the result of the last sweeps."""
         work = self.anatomy.memory
-        at: Tensor = work.here if self.settings.smooth_last % 2 == 0 else work.there
-        return at
+        return work.here if self.settings.smooth_last % 2 == 0 else work.there
 
     @cached_property
     def _commands(self) -> dict[str, list[Any]]:

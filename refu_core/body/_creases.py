@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import itertools
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from refu_core.body._model import SmplBody
 from refu_core.mesh import Connectivity
 from refu_core.skeleton import CARRIED, JOINT_NAMES, PARENTS
-
-if TYPE_CHECKING:
-    from refu_core.body._model import SmplBody
 
 LEVELS = (0.25, 0.5, 0.75)
 """A joint has a seam where this share of the skinning weight belongs to the joint and all that hangs on it. With the
@@ -147,5 +145,4 @@ def _parting(
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    unit: NDArray[np.float64] = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-    return unit
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)

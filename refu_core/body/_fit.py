@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,16 +17,11 @@ from torch import Tensor
 from refu_core._cache import keep, recall
 from refu_core.body._io import load_body
 from refu_core.body._model import BodyArrays, SmplBody
-from refu_core.body._register import ENDS, Registration, derivatives, register, size_of
+from refu_core.body._register import ENDS, Array, Registration, derivatives, register, size_of
 from refu_core.body._rest_pose import require_rest_pose
 from refu_core.body._surface import OnSurface
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.modes import BUILTIN_BODIES
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from refu_core.body._register import Array
 
 REGISTERED = "neutral"
 """The built-in body that is laid onto others: it is half way between the other two."""
@@ -123,8 +119,7 @@ class BodyFit:
         """`values` of the body's vertices (N, …), interpolated at the vertices of the built-in mesh (V, …)."""
         place = self.registration.place
         faces = self.body.faces.cpu().numpy()
-        there: Array = np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
-        return there
+        return np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
 
     def directions(self) -> Array:
         """What a unit of each beta does to the built-in mesh on this body [m], shape (V, 3, 10)."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from refu_core.body._fingers import without_fingers
@@ -17,11 +19,6 @@ from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinemat
 from refu_core.body._skinning import Skinning
 from refu_core.errors import BodyError, FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import ArrayLike, NDArray
 
 N_POSE_FEATURES = 9 * (N_JOINTS - 1)
 _TENSOR = "{} as a torch.Tensor, such as torch.as_tensor(array) gives"

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refu_core.body._kinematics import JOINT_NAMES
+from refu_core.body._model import BodyArrays, SmplBody
 from refu_core.body._segments import SOFTNESS, segment_of_face, shares
 from refu_core.errors import BodyError, MeshError
 from refu_core.mesh import Connectivity
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from refu_core.body._model import BodyArrays, SmplBody
 
 _TALL = (0.3, 2.2)
 """Least and greatest distance from ankles to neck [m]: children and giants."""
@@ -86,8 +81,7 @@ def _loose(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
 def _upward(joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """The way from the middle of the ankles to the neck [m], shape (3,)."""
     ankles = joints[[JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]]
-    found: NDArray[np.float64] = joints[JOINT_NAMES.index("neck")] - ankles.mean(0)
-    return found
+    return joints[JOINT_NAMES.index("neck")] - ankles.mean(0)
 
 
 def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:

@@ -25,16 +25,7 @@ from refu_core.body._collider_kernels import (
     level,
     settle,
 )
-from refu_core.body._part_kernels import (
-    Segments,
-    Skins,
-    deepen,
-    find_near,
-    follow,
-    part,
-    raise_edge,
-    touch,
-)
+from refu_core.body._part_kernels import Segments, Skins, deepen, find_near, follow, part, raise_edge, touch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,15 +37,7 @@ def is_due(step: int, only: int) -> bool:
 
 @wp.func
 def smooth(
-    before: int,
-    only: int,
-    first: int,
-    stride: int,
-    work: Work,
-    rings: Rings,
-    sweeps: int,
-    full: float,
-    share: float,
+    before: int, only: int, first: int, stride: int, work: Work, rings: Rings, sweeps: int, full: float, share: float
 ) -> None:
     """Sweeps over what was moved, in 1 + `sweeps` steps; the result is in `here` or, if `sweeps` is odd, in `there`.
 

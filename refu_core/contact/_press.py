@@ -164,8 +164,7 @@ class Press:
                 for sweep in range(self._settings.around):
                     commands[f"spread {sweep}"].launch()
                 commands["lower"].launch()
-        pressed: Tensor = self._points.clone()
-        return pressed
+        return self._points.clone()
 
 
 _PIECE = 32

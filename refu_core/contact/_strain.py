@@ -61,5 +61,4 @@ class StrainLimit:
             else:
                 for sweep in range(self._settings.sweeps):
                     self._sweeps[sweep % 2].launch()
-        limited: Tensor = self._points.clone()
-        return limited
+        return self._points.clone()

@@ -90,8 +90,7 @@ class Unfold:
                 for k in range(self._settings.levellings):
                     self._commands[f"level{k % 2}"].launch()
                 self._commands["bound"].launch()
-        unfolded: Tensor = self._points.clone()
-        return unfolded
+        return self._points.clone()
 
 
 def _share(garment: GarmentTemplate, others: Sequence[GarmentTemplate], near: float) -> Tensor:

@@ -111,11 +111,10 @@ def _split(f: Ints, middle: Ints) -> Ints:
     return triangles[np.argsort(np.concatenate([rows for rows, _ in parts]), kind="stable")]
 
 
-def _edges(f: Ints) -> tuple[Ints, Ints]:
+def _edges(f: Ints) -> tuple[NDArray[np.int32], Ints]:
     """Each edge once (E, 2), and the numbers of the edges (0, 1), (1, 2), (2, 0) of each face (F, 3)."""
-    pairs = np.sort(np.stack((f, np.roll(f, -1, 1)), -1).reshape(-1, 2), 1)
-    edges, of_corner = np.unique(pairs, axis=0, return_inverse=True)
-    return edges, of_corner.reshape(-1, 3)
+    known = Connectivity(f.astype(np.int32), int(f.max(initial=0)) + 1)
+    return known.edges, known.edge_of_corner
 
 
 def _without_strays(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:

@@ -213,8 +213,7 @@ def stretch(faces: Ints, before: F64, after: F64) -> F64:
     """How many times its former length each edge has, shape (E,)."""
     a, b = Connectivity.of(faces, len(before)).edges.T
     was, now = (np.linalg.norm(v[a] - v[b], axis=1) for v in (before, after))
-    found: F64 = now / np.maximum(was, 1e-9)
-    return found
+    return now / np.maximum(was, 1e-9)
 
 
 def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:
@@ -282,8 +281,7 @@ def _few(weights: F64) -> F64:
     kept = weights.clip(0).copy()
     np.put_along_axis(kept, np.argsort(-kept, axis=1)[:, _INFLUENCES:], 0.0, axis=1)
     kept[kept < 2e-3] = 0.0
-    found: F64 = kept / kept.sum(1, keepdims=True)
-    return found
+    return kept / kept.sum(1, keepdims=True)
 
 
 def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:

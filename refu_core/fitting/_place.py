@@ -130,8 +130,7 @@ class Place:
 
     def __call__(self, vertices: F64) -> F64:
         """Vertices (V, 3) on the body [m]."""
-        found: F64 = self.unit * vertices @ self.turn.T + self.shift
-        return found
+        return self.unit * vertices @ self.turn.T + self.shift
 
 
 _UNDER_ARMS = 0.1

@@ -67,7 +67,7 @@ class Transfer:
         """For a garment of vertices (V, 3) [m] and faces (F, 3), outward, on a posed body."""
         distance, gradient = body(vertices)
         face, barycentric = body.closest(vertices)
-        normals = vertex_normals(vertices, faces.astype(np.int32))
+        normals = vertex_normals(vertices, faces)
         agrees = (normals * gradient).sum(1)
         n_pieces, label = components(faces, len(vertices))
         rim = rim_vertices(faces)

@@ -99,7 +99,7 @@ class KeypointTracker:
                 self.reset()
                 return self._begin(seen, stamp_ns)
             self._correct(sided, dt)
-            if self._unfit_for > self._settings.doubt:
+            if max(self._unfit_for, self._swapped_for) > self._settings.doubt:
                 self._begin_again(seen)
         if 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             self.reset()
@@ -174,8 +174,8 @@ class KeypointTracker:
         self._swapped_for = self._unfit_for = 0.0
 
     def _begin_again(self, seen: _Seen) -> None:
-        """Starts again from this frame alone if that fits better, once the pose hasn't fitted for long."""
-        self._unfit_for = 0.0
+        """Starts again from this frame alone if that fits better, once pose or sides haven't fitted for long."""
+        self._swapped_for = self._unfit_for = 0.0
         guess = self._guessed(seen)
         if guess is not None and guess[2] < 0.7 * self._misfit(self._pose, seen):
             self._take(*guess)
@@ -209,7 +209,6 @@ class KeypointTracker:
                 taken[here], is_swapped = other[here], True
         self._swapped_for = self._swapped_for + dt if is_swapped else 0.0
         if self._swapped_for > self._settings.doubt:  # it was the prediction that had the sides wrong
-            self._swapped_for, self._unfit_for = 0.0, np.inf
             return seen
         return _Seen(seen.points[taken], seen.weights[taken])
 

@@ -103,10 +103,7 @@ class Figures:
             mean_energy=mean([frame.energy for frame in frames]),
             mean_collision_error_mm=mean([frame.collision_error_mm for frame in frames]),
             laplacian_mm=mean([frame.laplacian_mm for frame in frames if frame.laplacian_mm is not None]),
-            folds_1=ratios.get(1),
-            folds_4=ratios.get(4),
-            folds_16=ratios.get(16),
-            folds_64=ratios.get(64),
+            **{f"folds_{n}": ratios.get(n) for n in SWEEPS},
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -140,8 +137,7 @@ class FoldBands:
 
     def energies(self, vertices: Any) -> NDArray[np.float64]:
         """The energy of each band of vertices (V, ..., 3) [m], finest first [m^2], shape (4, ...)."""
-        energies: NDArray[np.float64] = (self.split(vertices)[:-1] ** 2).sum(axis=(1, -1))
-        return energies
+        return (self.split(vertices)[:-1] ** 2).sum(axis=(1, -1))
 
 
 class GarmentMetrics:

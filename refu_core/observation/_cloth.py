@@ -241,8 +241,7 @@ class ObservedCloth:
     @property
     def offset(self) -> F32:
         """The displacement that is added to the garment before it is posed [m], shape (V, 3)."""
-        found: F32 = self._lift[:, None] * self._out
-        return found
+        return self._lift[:, None] * self._out
 
     def place(self, vertices: F32) -> None:
         """Takes over where the garment's vertices are [m], shape (V, 3)."""
@@ -282,8 +281,7 @@ class ObservedCloth:
         lift = (along * self._out[corner]).sum(2)
         # A sparse product needs no copy of the rows that it gathers, which are as large as a processor's cache.
         ends = 3 * np.arange(m + 1, dtype=np.int32)
-        slopes: F32 = csr_array((lift.ravel(), corner.ravel(), ends), shape=(m, len(blend))) @ self._fields
-        return slopes
+        return csr_array((lift.ravel(), corner.ravel(), ends), shape=(m, len(blend))) @ self._fields
 
 
 def within(points: NDArray[np.floating], low: F32, high: F32) -> NDArray[np.bool_]:

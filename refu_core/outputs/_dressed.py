@@ -160,8 +160,7 @@ class DressedPerson:
 
     def turned(self, points: NDArray[Any]) -> NDArray[Any]:
         """Turns points (..., 3) that are relative to the body's origin from SMPL's axes into those of `rotation`."""
-        turned: NDArray[Any] = points @ self.rotation.T.astype(points.dtype)
-        return turned
+        return points @ self.rotation.T.astype(points.dtype)
 
     @cached_property
     def vertices(self) -> dict[str, NDArray[np.float32]]:

@@ -72,8 +72,7 @@ def rings_of(garment: GarmentTemplate) -> dict[str, Ring]:
 def newell(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The vector area of a closed polygon of points (K, 3) [m²], shape (3,)."""
     middle = points - points.mean(0)
-    area: NDArray[np.float64] = 0.5 * np.cross(middle, np.roll(middle, -1, axis=0)).sum(0)
-    return area
+    return 0.5 * np.cross(middle, np.roll(middle, -1, axis=0)).sum(0)
 
 
 def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
@@ -100,8 +99,7 @@ def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray
 
 def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Length of the edge from each point of a closed polygon (K, 3) [m] to the next, shape (K,)."""
-    length: NDArray[np.float64] = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
-    return length
+    return np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
 
 
 def _parts(
@@ -223,8 +221,7 @@ def _along(ring: Ring, rest: NDArray[np.float64]) -> NDArray[np.float64]:
     wanted -= (wanted @ normal) * normal
     middle = points - ring.shares @ points
     spread = (ring.shares[:, None] * middle).T @ middle
-    weight: NDArray[np.float64] = ring.shares * (middle @ np.linalg.pinv(spread, rcond=1e-4) @ wanted)
-    return weight
+    return ring.shares * (middle @ np.linalg.pinv(spread, rcond=1e-4) @ wanted)
 
 
 def _frame(name: str, ring: Ring, along: NDArray[np.float64], points: NDArray[np.float64]) -> Opening:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.mesh import Connectivity, vertex_areas
+from refu_core.mesh import Connectivity, face_normals, vertex_areas
 
 _EVEN = 0.03
 """An edge costs as much as missing a triangle's plane by this share of the edge's length. Cloth folds elsewhere in each
@@ -157,12 +157,11 @@ def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[NDArra
 
     Planes are weighted by area; boundaries add planes of their own.
     """
-    a, b, c = vertices[mesh.faces].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
+    normal = face_normals(vertices, mesh.faces)
     double = np.linalg.norm(normal, axis=1)
     normal /= np.maximum(double, 1e-18)[:, None]
     forms = np.zeros((len(vertices), 4, 4))
-    plane = np.concatenate((normal, -(normal * a).sum(1, keepdims=True)), axis=1)
+    plane = np.concatenate((normal, -(normal * vertices[mesh.faces[:, 0]]).sum(1, keepdims=True)), axis=1)
     third = double / 6
     for corner in range(3):
         np.add.at(forms, mesh.faces[:, corner], third[:, None, None] * plane[:, :, None] * plane[:, None])

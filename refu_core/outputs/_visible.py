@@ -91,8 +91,7 @@ class PinholeCamera:
     @property
     def eye(self) -> NDArray[np.float64]:
         """Where the camera is in the meshes' axes [m], shape (3,)."""
-        place: NDArray[np.float64] = -self.rotation.T @ self.translation
-        return place
+        return -self.rotation.T @ self.translation
 
     def scaled(self, width: int) -> PinholeCamera:
         """The same view with another number of columns, and rows in proportion."""

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import side_by_side
@@ -19,9 +20,6 @@ from refu_core.errors import MeshError
 from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
 from refu_core.realtime._dress import Dressed, dress, scale_of
 from refu_core.realtime._wearer import Outfit, Wearer
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Adjust = Callable[[Dressed], Dressed]
 """Changes what was predicted: garments, not bodies."""

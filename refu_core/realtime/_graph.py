@@ -5,16 +5,14 @@ from __future__ import annotations
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import joined_capture
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 MOST_GRAPHS = 8
 """How many graphs are kept; mostly they differ in the number of persons."""
@@ -81,8 +79,7 @@ class StepGraphs:
                 self._graphs[key] = graph  # the last one used
                 return graph(inputs)
         moved = {name: tensor.to(self._device) for name, tensor in inputs.items()}
-        result: NDArray[np.float32] = self._step(moved, numbers).cpu().numpy()
-        return result
+        return self._step(moved, numbers).cpu().numpy()
 
     def _captured(self, inputs: Mapping[str, Tensor], numbers: tuple[float, ...]) -> _Graph:
         while len(self._graphs) >= self._most:
@@ -109,5 +106,4 @@ class _Graph:
         self._host.copy_(self._captured.output, non_blocking=True)
         if self._captured.output.is_cuda:
             torch.cuda.current_stream(self._captured.output.device).record_event().synchronize()
-        result: NDArray[np.float32] = self._host.numpy().copy()
-        return result
+        return self._host.numpy().copy()

@@ -5,23 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from os import PathLike
+
+import torch
 
 from refu_core.backbones import Skinned, backbone_weights, with_dynamics
-from refu_core.body import ARMS, BodyFit, Collider, load_body, load_fit
+from refu_core.body import ARMS, BodyFit, Collider, SmplBody, load_body, load_fit
 from refu_core.errors import BodyError, GarmentError, WeightsError, require_type
 from refu_core.garments import GarmentTemplate, load_garment, worn_on
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.realtime._wearer import Outfit, Wearable
 from refu_core.refu import trained_from_weights
 from refu_core.weights import Weights, weights_folder
-
-if TYPE_CHECKING:
-    from os import PathLike
-
-    import torch
-
-    from refu_core.body import SmplBody
 
 
 def load_outfit(

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache, partial
 from numbers import Real
+from os import PathLike
 from types import NoneType
-from typing import TYPE_CHECKING, NoReturn, overload
+from typing import NoReturn, overload
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from refu_core._device import checked_device, own_settings
 from refu_core.backbones import Skinned
+from refu_core.body import SmplBody
 from refu_core.contact import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
 from refu_core.frames import LAGS, MAX_COEFFICIENT, N_BETAS, N_PAST, N_STYLES, SmplFrame, checked_numbers
@@ -24,22 +27,13 @@ from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
 from refu_core.realtime._crew import Crew
-from refu_core.realtime._frame import FrameStep, StageClock, packed_by
+from refu_core.realtime._frame import Adjust, FrameStep, Person, StageClock, packed_by
 from refu_core.realtime._graph import StepGraphs
 from refu_core.realtime._load import load_outfit
 from refu_core.realtime._outputs import FrameStats, GarmentMesh, GarmentStats, PipelineOutput, SkinShift
 from refu_core.realtime._promise import within_promise
 from refu_core.realtime._wearer import Wearer
 from refu_core.sdf import require_outward
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from os import PathLike
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from refu_core.body import SmplBody
-    from refu_core.realtime._frame import Adjust, Person
 
 _MOST_WEARERS = 64
 """How many persons' (β, γ) are remembered, those seen last; each takes about half a megabyte per garment."""

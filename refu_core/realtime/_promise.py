@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.body import JOINT_NAMES
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from refu_core.frames import SmplFrame
+from refu_core.frames import SmplFrame
 
 PROMISED_SIZE = 3.0
 """Components of β and γ are promised up to this size, in standard deviations. At a γ of 12, 65 vertices of a T-shirt

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.body import rotvec_to_rotmat
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,5 +44,4 @@ class RootTurn:
 
     def to_host(self, points: Tensor) -> NDArray[np.float32]:
         """The same, as an array on the host."""
-        seen: NDArray[np.float32] = self(points).cpu().numpy()
-        return seen
+        return self(points).cpu().numpy()

@@ -64,13 +64,16 @@ class Outfit:
 
     def beside(self) -> Outfit:
         """The same with a collider of its own, for another thread: nothing else has memory that a frame works in."""
-        return self if self.collider is None else replace(self, collider=Collider(self.body, gap=self.collider.gap))
+        return replace(self, collider=self._collider_of(self.body))
 
     def to(self, dtype: torch.dtype) -> Outfit:
         """The same in another precision; nothing is shared."""
         body = self.body.to(dtype=dtype)
-        collider = None if self.collider is None else Collider(body, gap=self.collider.gap)
-        return Outfit(body, {name: _cast(one, dtype) for name, one in self.wearables.items()}, collider, self.fit)
+        wearables = {name: _cast(one, dtype) for name, one in self.wearables.items()}
+        return Outfit(body, wearables, self._collider_of(body), self.fit)
+
+    def _collider_of(self, body: SmplBody) -> Collider | None:
+        return None if self.collider is None else Collider(body, settings=self.collider.settings)
 
 
 class UnposedGarment(NamedTuple):

@@ -30,7 +30,7 @@ SMPL_POINTS = tuple(_SMPL.split())
 """SMPL's joints that SMPL-H and SMPL-X also have, by their names in the keypoint layouts."""
 _BONES = (0.4, 2.5)
 """Least and greatest ratio of a bone's length to the mean body's, each taken as a share of the length of the legs."""
-_NOTHING = 1e-3
+_NOTHING = 1e-3  # least length of the legs, in the file's unit: bodies of zeros have none
 
 N_KEYPOINTS = 70
 _MHR = "nose l_eye r_eye l_ear r_ear l_shoulder r_shoulder l_elbow r_elbow l_hip r_hip l_knee r_knee l_ankle r_ankle "

@@ -37,8 +37,7 @@ _UP = 0.5
 
 def _are_sound(roots: Array) -> NDArray[np.bool_]:
     """Which roots are small enough to compute with; NaN isn't."""
-    sound: NDArray[np.bool_] = np.abs(roots).max(axis=1) <= MAX_ANGLE
-    return sound
+    return np.abs(roots).max(axis=1) <= MAX_ANGLE
 
 
 def up_of_root(roots: Array) -> Array:

@@ -24,7 +24,7 @@ _DISTANCE_UNIT = 0.01
 """g reads distances in cm, so that they are about as large as the latent vector that it reads with them."""
 _SHARPNESS = 20.0
 """Of the softplus that keeps α in its range. α starts at 1.03 (least 1) or 1.00 (least 0), with a steep derivative."""
-_MAX_SCALE = 100.0
+_MAX_SCALE = 100.0  # greatest α
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,7 @@ class ScaleNet(nn.Module):
         """z, shape (B, M), of betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         if self.settings.kind == "distance":
             return betas[:, :0]
-        z: Tensor = self.h(scale_inputs(betas, pose, style))
-        return z
+        return self.h(scale_inputs(betas, pose, style))
 
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor, distance: Tensor) -> Tensor:
         """α, shape (R,), of vertices number `vertex` (R,) of bodies number `body` (R,) with features z (B, M).
@@ -119,8 +118,7 @@ class ScaleNet(nn.Module):
         # A pose far beyond training may overflow the networks; α = 1 is right to first order.
         usual = 1 - self.least
         bounded = torch.nan_to_num(raw + usual, nan=usual, posinf=_MAX_SCALE, neginf=-_MAX_SCALE)
-        alpha: Tensor = self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
-        return alpha
+        return self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
 
     def of_body(self, z: Tensor) -> VertexScale:
         """α as `Resolver` asks for it, for the one body whose feature is z, shape (M,) or (1, M)."""
@@ -188,8 +186,7 @@ class _CompactLatent(nn.Module):
         nn.init.ones_(self.projection.bias)
 
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor) -> Tensor:
-        latent: Tensor = self.embedding[vertex] * self.projection(z)[body]
-        return latent
+        return self.embedding[vertex] * self.projection(z)[body]
 
 
 def _shared_latent_size(m: int, n: int, settings: ScaleSettings) -> int:

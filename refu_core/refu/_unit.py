@@ -38,8 +38,7 @@ def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, m
     deficit = margin - sample.distance[rows]
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     offset = (alpha * deficit).clamp(-MAX_DISPLACEMENT, MAX_DISPLACEMENT)
-    pushed: Tensor = points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
-    return pushed
+    return points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
 
 
 def pushed_rows(distance: Tensor, margin: float) -> Tensor:
@@ -53,8 +52,7 @@ def unit_direction(gradient: Tensor) -> Tensor:
     defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
     # Replacing it before normalising keeps NaN out of the branch that isn't taken, and so out of the derivative.
     usable = torch.where(defined, gradient, gradient.new_tensor(_UP))
-    direction: Tensor = usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
-    return direction
+    return usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
 
 
 def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float) -> None:

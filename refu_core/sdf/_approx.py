@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,8 +12,9 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import Repeated, as_warp, memory
-from refu_core.body import SEGMENTS, part_of_faces
+from refu_core.body import SEGMENTS, SmplBody, part_of_faces
 from refu_core.errors import MeshError
+from refu_core.garments import GarmentTemplate
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
 from refu_core.sdf._protocol import GarmentSdf, SdfSample
@@ -29,10 +30,6 @@ from refu_core.sdf._walk_kernels import (
     requery_deep_kernel,
     walk_kernel,
 )
-
-if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
 
 _SPACING = 0.05
 """Edge of the cubes in the rest pose that each hold one guide of each part [m]."""

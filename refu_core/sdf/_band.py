@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import warp as wp
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import Repeated, memory, recorded
+from refu_core.body import SmplBody
 from refu_core.errors import MeshError
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Adjacency
 from refu_core.sdf._band_kernels import (
     ASKED,
@@ -30,10 +32,6 @@ from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
 from refu_core.sdf._protocol import GarmentSdf, SdfSample
 from refu_core.sdf._query_kernels import query_skin_kernel
-
-if TYPE_CHECKING:
-    from refu_core.body import SmplBody
-    from refu_core.garments import GarmentTemplate
 
 BAND = 0.008
 """Width of the band on either side of the skin [m]. It must be at least the margin that is kept. And most of a

@@ -64,8 +64,7 @@ class ExactSdf(MeshSdf):
         Raises `MeshError` when the faces aren't a closed, consistently oriented surface.
         """
         if sign not in ("normal", "winding"):
-            msg = f'sign must be "normal" or "winding", got {sign!r}'
-            raise MeshError(msg)
+            raise MeshError(f'sign must be "normal" or "winding", got {sign!r}')
         super().__init__(faces, device=device)
         self._by_winding = sign == "winding"
         self._rebuild_distance = rebuild_distance

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -13,14 +13,12 @@ from torch import Tensor
 
 from refu_core._warp import Repeated, as_warp, ints, memory
 from refu_core.errors import MeshError
+from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
 from refu_core.sdf._analytic import Feature, signed_distance
 from refu_core.sdf._closest_kernels import PosedMesh, feature_kernel
 from refu_core.sdf._protocol import GarmentSdf, SdfSample, plain_garment_sdf
 from refu_core.sdf._query_kernels import Skin
-
-if TYPE_CHECKING:
-    from refu_core.garments import GarmentTemplate
 
 
 class Found(NamedTuple):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,16 +14,10 @@ from torch import Tensor, nn
 from refu_core.body import SmplBody, rotvec_to_rotmat
 from refu_core.errors import MeshError, WeightsError
 from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.garments import GarmentTemplate
 from refu_core.sdf._mesh import require_points
 from refu_core.sdf._protocol import GarmentSdf, SdfSample, plain_garment_sdf
 from refu_core.weights import Weights, build_for, config_of_card, load_weights, save_weights
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-    from typing import Any
-
-    from refu_core.garments import GarmentTemplate
 
 _CONDITION = N_BETAS + 3 * (N_JOINTS - 1)
 _MOST_LAYERS = 64
@@ -94,8 +90,7 @@ class SdfNetwork(nn.Module):
         h = self.activation(self.point(points) + condition[:, None])
         for number, layer in enumerate(self.layers, start=1):
             h = self.activation(layer(torch.cat((h, points.to(h.dtype)), -1) if number == self.config.skip else h))
-        distance: Tensor = self.last(h)[..., 0]
-        return distance
+        return self.last(h)[..., 0]
 
 
 def with_gradient(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,11 +12,9 @@ from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 
 from refu_core._warp import Repeated, ints
+from refu_core.body import SmplBody
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._walk_kernels import grid_lookup_kernel
-
-if TYPE_CHECKING:
-    from refu_core.body import SmplBody
 
 _CELL = 0.015
 """Edge of the grid's cells [m]: less than the body's longer edges, so a look-up is mostly off by one face at most."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from refu_core.body import DEFAULT_GAP, Collider, SmplBody
+from refu_core.body import DEFAULT_GAP, Collider, ColliderSettings, SmplBody
 from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
@@ -196,7 +196,7 @@ class Draper:
         # each drape, on a mesh that depends on the drape alone, and never in between.
         sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._sdf = sdf
-        self._collider = Collider(body, gap=self.settings.gap)
+        self._collider = Collider(body, settings=ColliderSettings(gap=self.settings.gap))
         counts = [garment.n_vertices for garment in self.outfit.garments]
         piece = np.repeat(np.arange(len(counts)), counts)
         self.cloth = SimulatedCloth(self.topology, sdf, piece=piece, settings=self.settings.cloth)
@@ -219,8 +219,7 @@ class Draper:
 
     def rest(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> F32:
         """The garment cut for this shape and style [m], shape (N, 3): its edges are the cloth's rest lengths."""
-        rest: F32 = self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
-        return rest
+        return self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
 
     def bodies(self, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
         """What cloth lies on: the colliders of poses (P, 24, 3) [rad] and a shape (10,) [m], shape (P, V, 3)."""
@@ -307,5 +306,4 @@ class Draper:
 
     def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
-        turned: F32 = np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
-        return turned
+        return np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)

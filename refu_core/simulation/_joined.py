@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from refu_core.errors import SimulationError
 from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate, inner_first
+from refu_core.mesh import face_normals
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32
 
@@ -71,8 +72,7 @@ def _over_skin(sdf: ExactSdf, body: F32, points: F32) -> tuple[F32, F32]:
     """Signed distances of points (P, 3) to the skin [m], (P,), and the normals of the skin below them, (P, 3)."""
     found = sdf.closest(torch.from_numpy(np.ascontiguousarray(points)))
     height = (found.distance * found.sign).numpy()
-    a, b, c = body[sdf.faces.numpy()[found.face.numpy()]].transpose(1, 0, 2)
-    normals: F32 = np.cross(b - a, c - a)
+    normals = face_normals(body, sdf.faces.numpy()[found.face.numpy()])
     return height, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 

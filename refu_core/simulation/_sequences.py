@@ -55,8 +55,7 @@ class DrawnMotion:
         smooth = gaussian_filter1d(self.transl, _SMOOTH, axis=0, mode="nearest")
         second = np.gradient(np.gradient(smooth, axis=0), axis=0) * (FPS * STEPS) ** 2
         size = np.linalg.norm(second, axis=1, keepdims=True)
-        limited: NDArray[np.float64] = second * np.minimum(1, _MOST_ACCELERATION / np.maximum(size, 1e-9))
-        return limited
+        return second * np.minimum(1, _MOST_ACCELERATION / np.maximum(size, 1e-9))
 
 
 def n_steps(n_frames: int) -> int:

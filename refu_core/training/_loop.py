@@ -156,12 +156,10 @@ class Loop:
                     msg = f"the loss of {stage.name} is {train_loss} at step {step}: try a smaller learning rate"
                     raise RefuError(msg)
                 held_out = self._validate(stage)
-                since += 1
+                since = 0 if held_out is None else since + 1
                 if held_out is not None and held_out < best:
                     best, since = held_out, 0
                     best_state = {k: v.detach().clone() for k, v in objective.state_dict().items()}
-                if held_out is None:
-                    since = 0
                 shown = {"train": train_loss} if held_out is None else {"train": train_loss, "validation": held_out}
                 if stage.watch is not None and is_writer():
                     shown = stage.watch()

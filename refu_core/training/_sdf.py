@@ -146,8 +146,7 @@ def sdf_loss(distance: Tensor, gradient: Tensor, batch: SdfBatch) -> Tensor:
     value = (distance - batch.distance).abs().mean()
     normal = (gradient[:, :on_surface] - batch.normals).norm(dim=-1).mean()
     eikonal = (gradient[:, on_surface:].norm(dim=-1) - 1).square().mean()
-    loss: Tensor = VALUE_WEIGHT * value + NORMAL_WEIGHT * normal + EIKONAL_WEIGHT * eikonal
-    return loss
+    return VALUE_WEIGHT * value + NORMAL_WEIGHT * normal + EIKONAL_WEIGHT * eikonal
 
 
 @torch.no_grad()

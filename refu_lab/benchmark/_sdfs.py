@@ -29,10 +29,7 @@ PLAIN_QUERY = "warp refit + query"
 
 @wp.kernel(enable_backward=False)
 def plain_kernel(
-    mesh: wp.uint64,
-    points: wp.array[wp.vec3],
-    distance: wp.array[wp.float32],
-    gradient: wp.array[wp.vec3],
+    mesh: wp.uint64, points: wp.array[wp.vec3], distance: wp.array[wp.float32], gradient: wp.array[wp.vec3]
 ) -> None:
     """Warp's own query as in its documentation: the signed distance [m] and its gradient at `points` [m]."""
     i = wp.tid()

@@ -51,8 +51,7 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
         yield InProcess()
         return
     if find_spec("distributed") is None:
-        msg = 'several processes are run by Dask, which isn\'t installed: pip install "refu-ros[cluster]"'
-        raise FleetError(msg)
+        raise FleetError('several processes are run by Dask, which isn\'t installed: pip install "refu-ros[cluster]"')
     import dask
     from distributed import Client
 

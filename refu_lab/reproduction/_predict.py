@@ -36,10 +36,7 @@ class GarmentSetup:
         self.body = load_body(self.template.body) if fit is None else fit.body
         self.collider = Collider(self.body) if library.collider else None
         self.exact, self.approx = ExactSdf(self.body.faces), ApproxSdf(self.body)
-        self.ask = {
-            "accurate": self.exact.of_garment(self.template),
-            "approx": self.approx.of_garment(self.template),
-        }
+        self.ask = {"accurate": self.exact.of_garment(self.template), "approx": self.approx.of_garment(self.template)}
         """Functions that give the distances of the garment's own vertices."""
         self.post_process = PostProcess(self.template.faces, self.template.n_vertices)
         self.blend = Blend.of_faces(self.template.faces, self.template.n_vertices)

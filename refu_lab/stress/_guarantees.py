@@ -17,6 +17,7 @@ from refu_core.body import Surface
 from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT, OwnSide
 from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
+from refu_core.mesh import face_normals
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.realtime import GarmentMesh, GarmentPipeline, PipelineOutput, Wearer, dress
 from refu_core.refu import MAX_DISPLACEMENT
@@ -237,8 +238,7 @@ def _above(points: NDArray[np.float32], sheet: GarmentMesh) -> tuple[NDArray[np.
     surface = Surface(sheet.local.astype(np.float64), sheet.faces.astype(np.int32))
     found = surface.closest(points.astype(np.float64))
     closest = surface.at(found)
-    a, b, c = surface.vertices[surface.faces[found.face]].transpose(1, 0, 2)
-    up = np.cross(b - a, c - a)
+    up = face_normals(surface.vertices, surface.faces[found.face])
     return closest, ((points - closest) * up).sum(axis=1) / np.linalg.norm(up, axis=1)
 
 

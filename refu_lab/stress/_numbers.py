@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from refu_core.mesh import face_normals
 from refu_core.sdf import ExactSdf
 from refu_lab.stress._trial import Measurement, Subject, Trial, distance_to_mesh, predicted
 
@@ -16,7 +17,7 @@ ROUNDING = 5e-6
 COLLIDER_ROUNDING = 2e-5
 """The same with the collider [m], which divides short distances between two surfaces. It holds in everyday poses only:
 where joints turn as in no real body, rounding may decide which of two sides is nearer."""
-_DISTANCE_ROUNDING = 2e-6
+_DISTANCE_ROUNDING = 2e-6  # [m], relative beyond a metre
 _POINTS = 24
 _UNIT = 1e-3
 """How far the length of a gradient may be from one."""
@@ -75,17 +76,16 @@ def _on_edges(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
 
 
 def _mixed(vertices: F32, faces: I64, weights: F64) -> F64:
-    mixed: F64 = (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
-    return mixed
+    return (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
 
 
 def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     """Points half-way between the skin and the skin opposite, where the gradient flips."""
     chosen = faces[rng.integers(len(faces), size=_POINTS)]
-    a, b, c = vertices[chosen].astype(np.float64).transpose(1, 0, 2)
-    inward = -np.cross(b - a, c - a)
+    exact = vertices.astype(np.float64)
+    inward = -face_normals(exact, chosen)
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-300)
-    start = (a + b + c) / 3
+    start = exact[chosen].mean(1)
     sdf = ExactSdf(faces)
     sdf.update(torch.from_numpy(vertices))
     # Bisect for the depth at which another part of the skin becomes as near as the part above.
@@ -95,8 +95,7 @@ def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
         points = torch.from_numpy((start + middle[:, None] * inward).astype(np.float32))
         is_under = sdf.query(points).distance.abs().numpy() >= middle - 1e-6
         low, high = np.where(is_under, middle, low), np.where(is_under, high, middle)
-    halfway: F64 = start + ((low + high) / 2)[:, None] * inward
-    return halfway
+    return start + ((low + high) / 2)[:, None] * inward
 
 
 def _hair(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:

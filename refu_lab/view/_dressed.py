@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import msg_adapters as adapters
-from refu_core import RefuError
+from refu_core import RefuError, SmplFrame
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
 from refu_core.history import PoseHistory
+from refu_core.realtime import PipelineOutput
 from refu_core.recordings import SUFFIXES, upright_turn
+from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
 from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from refu_core import SmplFrame
-    from refu_core.realtime import PipelineOutput
-    from refu_lab.commands.replay import RecordingOptions
 
 _AWAY_S = 0.25
 """A person whose nearest frame is farther off in time isn't shown [s]."""
@@ -76,8 +70,7 @@ class DressedFilm:
     @property
     def times(self) -> NDArray[np.float64]:
         """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
-        times: NDArray[np.float64] = self._moments - self._moments[0]
-        return times
+        return self._moments - self._moments[0]
 
     @property
     def front(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,18 +13,14 @@ from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.modes import SdfMode
 from refu_lab.view._dressed import DressedFilm
-from refu_lab.view._film import BODY, SKIN
+from refu_lab.view._film import BODY, SKIN, SceneMesh
 from refu_lab.view._live import LiveFilm
 from refu_lab.view._marks import CLEARANCE, Band, BandFinder, Marking
+from refu_lab.view._recorded import RecordedFilm
 from refu_lab.view._stage import Stage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     import viser
-
-    from refu_lab.view._film import SceneMesh
-    from refu_lab.view._recorded import RecordedFilm
 
 _SPEEDS = {"¼ ×": 0.25, "½ ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "4 ×": 4.0}
 _HIDDEN = "hidden"

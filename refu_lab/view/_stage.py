@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters import vertices_ros_from_smpl, vertices_smpl_from_ros
 from refu_lab.render import Viewpoint
+from refu_lab.view._film import SceneMesh
+from refu_lab.view._marks import Band
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     import viser
-    from numpy.typing import NDArray
-
-    from refu_lab.view._film import SceneMesh
-    from refu_lab.view._marks import Band
 
 _FOV = 30.0
 """Vertical field of view [degrees]: a long lens, so that proportions look natural."""

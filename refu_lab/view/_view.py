@@ -8,22 +8,20 @@ import os
 import socket
 import sys
 import webbrowser
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from refu_core import RefuError
 from refu_core._device import one_thread
 from refu_core.recordings import SUFFIXES
+from refu_lab.commands.view import ViewOptions
+from refu_lab.view._dressed import DressedFilm
 from refu_lab.view._live import TOPICS, LiveFilm
+from refu_lab.view._recorded import RecordedFilm, has_meshes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import viser
-
-    from refu_lab.commands.view import ViewOptions
-    from refu_lab.view._dressed import DressedFilm
-    from refu_lab.view._recorded import RecordedFilm
 
 DEFAULT_PORT = 8080
 _PORTS = 20
@@ -43,10 +41,7 @@ def view(
     Raises `RefuError` for inputs that can't be shown, for a port that is taken, and if viser isn't installed.
     """
     if find_spec("viser") is None:
-        msg = 'the viewer needs viser: pip install "refu-ros[view]"'
-        raise RefuError(msg)
-    from refu_lab.view._dressed import DressedFilm
-
+        raise RefuError('the viewer needs viser: pip install "refu-ros[view]"')
     film = open_film(options, progress=progress)
     with contextlib.ExitStack() as opened:
         if not isinstance(film, DressedFilm):
@@ -91,9 +86,6 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
         raise RefuError("wanted either recordings to look at or --live, for a node that runs")
     if options.live is not None:
         return LiveFilm(options.live or TOPICS)
-    from refu_lab.view._dressed import DressedFilm
-    from refu_lab.view._recorded import RecordedFilm, has_meshes
-
     first = options.inputs[0]
     names_motion = options.dressing.topic is not None or options.dressing.input_type is not None
     if not (options.dress or names_motion or first.suffix.lower() in SUFFIXES) and has_meshes(first):

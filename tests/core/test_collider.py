@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refu_core import load_body
-from refu_core.body import ARMS, Collider, RigidTransforms, SmplBody, rotvec_to_rotmat
+from refu_core.body import ARMS, Collider, ColliderSettings, RigidTransforms, SmplBody, rotvec_to_rotmat
 from refu_core.errors import MeshError
 from refu_core.metrics import SelfContactDetector
+from refu_core.realtime import Outfit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -169,11 +170,15 @@ def test_it_turns_with_the_body(name: str, body: SmplBody, collider: Collider) -
 
 def test_a_larger_gap_pushes_farther(body: SmplBody) -> None:
     skin = body(pose=posed(body, POSES["hanging arms"]))
-    narrow, wide = (
-        float((Collider(body, gap=gap)(skin.vertices, skin.transforms) - skin.vertices).norm(dim=2).max())
-        for gap in (0.004, 0.012)
-    )
+    colliders = [Collider(body, settings=ColliderSettings(gap=gap)) for gap in (0.004, 0.012)]
+    narrow, wide = (float((one(skin.vertices, skin.transforms) - skin.vertices).norm(dim=2).max()) for one in colliders)
     assert narrow + 2 * MM < wide < narrow + 8 * MM
+
+
+def test_copies_of_an_outfit_keep_the_settings_of_its_collider(body: SmplBody) -> None:
+    settings = ColliderSettings(farthest=0.02)
+    outfit = Outfit(body, {}, Collider(body, settings=settings))
+    assert {one.collider.settings for one in (outfit.beside(), outfit.to(torch.float64)) if one.collider} == {settings}
 
 
 @pytest.mark.parametrize("name", INSIDE)

@@ -205,6 +205,15 @@ def test_exchanged_sides_are_put_right(group: tuple[str, ...]) -> None:
     assert off[18:45].mean() < 0.02
 
 
+@pytest.mark.parametrize("layout", ["coco17", "zed38"])
+def test_legs_exchanged_in_the_first_frame_are_put_right_after_a_second(layout: str) -> None:
+    """Although the rest of the body fits well meanwhile."""
+    kept = keypoint_layout(layout)
+    exchanged = np.where(np.isin(kept.joints, (1, 2, 4, 5, 7, 8, 10, 11)), kept.mirrored, range(len(kept)))
+    got, known = followed(lambda i, points: points if i else points[exchanged], layout)
+    assert errors(got, known)[35:].mean(axis=1).max() < 0.012
+
+
 def test_an_arm_that_is_not_seen_for_long_comes_to_rest_and_comes_back() -> None:
     kept = keypoint_layout("zed38")
     arm = [i for i, joint in enumerate(kept.joints) if JOINT_NAMES[joint] in ("left_elbow", "left_wrist")]
