@@ -38,7 +38,8 @@ def up_of_sender(axes: InputAxes, frame_id: str, turn: NDArray[np.float64]) -> N
     """
     if axes == "smpl" and (turn == np.eye(3)).all():
         return np.array([0.0, 1.0, 0.0])
-    return (turn @ ros_from_sender(axes)).T @ up_of(frame_id)
+    up: NDArray[np.float64] = (turn @ ros_from_sender(axes)).T @ up_of(frame_id)
+    return up
 
 
 def vertices_ros_from_smpl(vertices: NDArray[Any]) -> NDArray[Any]:

@@ -100,7 +100,8 @@ class PickledArrays:
             raise ValueError(f"a tensor that reaches to number {last} of {len(flat)}")
         steps = tuple(stride * flat.itemsize for stride in strides)
         view: NDArray[Any] = np.lib.stride_tricks.as_strided(flat[offset:], shape, steps, writeable=False)
-        return view.copy()
+        dense: NDArray[Any] = view.copy()
+        return dense
 
     def _sparse(self, kind: str, state: dict[str, Any]) -> NDArray[Any]:
         """A `scipy.sparse` matrix: compressed columns, compressed rows, or coordinates."""

@@ -144,7 +144,10 @@ def torch_stream(device: torch.device) -> contextlib.AbstractContextManager[Any]
         return _NO_STREAM
     stream = _same_stream(torch.cuda.current_stream(device))
     # While torch captures a graph, work on another stream can't be waited for.
-    return wp.ScopedStream(stream, sync_enter=not torch.cuda.is_current_stream_capturing())
+    scope: contextlib.AbstractContextManager[Any] = wp.ScopedStream(
+        stream, sync_enter=not torch.cuda.is_current_stream_capturing()
+    )
+    return scope
 
 
 _NO_STREAM = contextlib.nullcontext()

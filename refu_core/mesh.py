@@ -71,7 +71,8 @@ class Connectivity:
     @property
     def boundary(self) -> NDArray[np.int32]:
         """The edges that have only one face, shape (B, 2)."""
-        return self.edges[self.n_faces_of_edge == 1]
+        boundary: NDArray[np.int32] = self.edges[self.n_faces_of_edge == 1]
+        return boundary
 
     @cached_property
     def ring(self) -> Adjacency:
@@ -193,7 +194,8 @@ def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.integer[Any]]) -
     """Unit normals at vertices (V, 3) of faces (F, 3): the area-weighted mean of faces around each, shape (V, 3)."""
     normals = np.zeros_like(vertices)
     np.add.at(normals, faces, face_normals(vertices, faces)[:, None])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    unit: NDArray[_Float] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    return unit
 
 
 def vertex_areas(vertices: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]]) -> NDArray[np.float64]:

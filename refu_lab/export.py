@@ -176,7 +176,8 @@ def _glb(meshes: Sequence[ExportMesh], frame: int, origin: NDArray[np.float64]) 
             node_name=mesh.name,
             transform=trimesh.transformations.translation_matrix(origin),
         )
-    return scene.export(file_type="glb")
+    data: bytes = scene.export(file_type="glb")
+    return data
 
 
 def _obj(meshes: Sequence[ExportMesh], frame: int) -> bytes:

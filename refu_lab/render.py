@@ -301,7 +301,8 @@ def _uncovered(light: NDArray[np.float32], covered: NDArray[np.bool_], faces: ND
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(length, 1e-30)
+    result: NDArray[np.float64] = vectors / np.maximum(length, 1e-30)
+    return result
 
 
 def _to_linear(srgb: ArrayLike) -> NDArray[np.float64]:

@@ -239,7 +239,8 @@ class BagJob:
                     said = line.decode(errors="replace").strip() or said
             code = self._process.wait()
             with contextlib.suppress(OSError, ValueError):
-                return json.loads(self._result.read_bytes())
+                result: dict[str, Any] = json.loads(self._result.read_bytes())
+                return result
         if code in (_INTERRUPTED, -signal.SIGTERM):
             said = "cancelled before a frame was done"
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))

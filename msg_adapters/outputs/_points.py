@@ -119,7 +119,8 @@ def _layout(fields: Sequence[str], *, most_vertices: int) -> np.dtype[Any]:
 def _columns(points: NDArray[Any], first: str) -> NDArray[np.float32]:
     """Three float32 columns that lie side by side, as one view of shape (N, 3)."""
     at = points.dtype.fields[first][1]  # type: ignore[index]
-    return np.ndarray((len(points), 3), "<f4", points.data, at, (points.dtype.itemsize, 4))
+    columns: NDArray[np.float32] = np.ndarray((len(points), 3), "<f4", points.data, at, (points.dtype.itemsize, 4))
+    return columns
 
 
 def points_of(message: Any) -> NDArray[Any]:

@@ -62,11 +62,12 @@ def _markers(
 
         arrays = [vertices(one) for one in worn]
         key = tuple(one.person for one in worn), frame_id, lifetime_ns
-        return layouts.get(key, make, n_people=len(worn)).encode(
+        data: bytes = layouts.get(key, make, n_people=len(worn)).encode(
             [points for own in arrays for points in own],
             stamp_ns=[one.stamp_ns for one, own in zip(worn, arrays, strict=True) for _ in own],
             transl=[one.offset for one, own in zip(worn, arrays, strict=True) for _ in own],
         )
+        return data
 
     return encode
 

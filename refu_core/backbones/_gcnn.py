@@ -199,4 +199,5 @@ class Gcnn(WithoutWearerCode, nn.Module):
         x = z.view(len(z), -1, self.config.channels[0]).transpose(0, 1)
         for layer in self.layers[:-1]:
             x = functional.elu(layer(x))
-        return self.mean + self.scale * self.layers[-1](x).transpose(0, 1)
+        displacement: Tensor = self.mean + self.scale * self.layers[-1](x).transpose(0, 1)
+        return displacement

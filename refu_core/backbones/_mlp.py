@@ -49,8 +49,10 @@ class Mlp(WithoutWearerCode, nn.Module):
         wearer_code: Tensor | None = None,  # noqa: ARG002
     ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
-        return self.decoder(self.code(self.features(pose), style_shape(betas, style)))
+        displacement: Tensor = self.decoder(self.code(self.features(pose), style_shape(betas, style)))
+        return displacement
 
     def code(self, x: Tensor, s: Tensor) -> Tensor:
         """Code, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""
-        return self.net(torch.cat((x, s), 1))
+        code: Tensor = self.net(torch.cat((x, s), 1))
+        return code

@@ -91,7 +91,8 @@ class Perceptron(_Standardised):
         for layer in hidden:
             x = self.activation(layer(x))
             x = functional.dropout(x, self.dropout) if self.training else x
-        return last(x)
+        out: Tensor = last(x)
+        return out
 
 
 class StackedPerceptrons(_Standardised):

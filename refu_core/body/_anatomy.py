@@ -286,4 +286,5 @@ def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArra
         means = np.zeros_like(normals)
         np.add.at(means, ring.owner, normals[ring.items])
         normals = 0.5 * (normals + means / np.diff(ring.start)[:, None])
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    unit: NDArray[np.float64] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return unit

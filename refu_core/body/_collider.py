@@ -108,7 +108,8 @@ class Collider:
     def _parted(self) -> Tensor:
         """The buffer that holds the result of the last sweeps."""
         work = self.anatomy.memory
-        return work.here if self.settings.smooth_last % 2 == 0 else work.there
+        at: Tensor = work.here if self.settings.smooth_last % 2 == 0 else work.there
+        return at
 
     @cached_property
     def _commands(self) -> dict[str, list[Any]]:

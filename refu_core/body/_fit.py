@@ -119,7 +119,8 @@ class BodyFit:
         """`values` of the body's vertices (N, …), interpolated at the vertices of the built-in mesh (V, …)."""
         place = self.registration.place
         faces = self.body.faces.cpu().numpy()
-        return np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
+        there: Array = np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
+        return there
 
     def directions(self) -> Array:
         """What a unit of each beta does to the built-in mesh on this body [m], shape (V, 3, 10)."""

@@ -81,7 +81,8 @@ def _loose(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
 def _upward(joints: NDArray[np.float64]) -> NDArray[np.float64]:
     """The way from the middle of the ankles to the neck [m], shape (3,)."""
     ankles = joints[[JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]]
-    return joints[JOINT_NAMES.index("neck")] - ankles.mean(0)
+    found: NDArray[np.float64] = joints[JOINT_NAMES.index("neck")] - ankles.mean(0)
+    return found
 
 
 def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:

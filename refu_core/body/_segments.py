@@ -54,7 +54,8 @@ def shares(weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def segment_of_face(faces: NDArray[np.integer], share: NDArray[np.float64]) -> NDArray[np.intp]:
     """The segment of each face, shape (F,)."""
-    return share[faces].sum(axis=1).argmax(axis=1)
+    found: NDArray[np.intp] = share[faces].sum(axis=1).argmax(axis=1)
+    return found
 
 
 def cut(faces: NDArray[np.int32], share: NDArray[np.float64]) -> Solids:

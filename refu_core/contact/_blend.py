@@ -65,7 +65,8 @@ class Blend:
         field = self.spread((pushed - points).transpose(0, 1), least=lack.clamp_min(0).T).transpose(0, 1)
         length = torch.linalg.vector_norm(field.detach(), dim=-1, keepdim=True)
         most = DEFAULT_CONTACT.max_displacement
-        return points + field * (most / length.clamp_min(most))
+        blended: Tensor = points + field * (most / length.clamp_min(most))
+        return blended
 
     def spread(
         self,

@@ -164,7 +164,8 @@ class Press:
                 for sweep in range(self._settings.around):
                     commands[f"spread {sweep}"].launch()
                 commands["lower"].launch()
-        return self._points.clone()
+        pressed: Tensor = self._points.clone()
+        return pressed
 
 
 _PIECE = 32

@@ -61,4 +61,5 @@ class StrainLimit:
             else:
                 for sweep in range(self._settings.sweeps):
                     self._sweeps[sweep % 2].launch()
-        return self._points.clone()
+        limited: Tensor = self._points.clone()
+        return limited

@@ -90,7 +90,8 @@ class Unfold:
                 for k in range(self._settings.levellings):
                     self._commands[f"level{k % 2}"].launch()
                 self._commands["bound"].launch()
-        return self._points.clone()
+        unfolded: Tensor = self._points.clone()
+        return unfolded
 
 
 def _share(garment: GarmentTemplate, others: Sequence[GarmentTemplate], near: float) -> Tensor:

@@ -213,7 +213,8 @@ def stretch(faces: Ints, before: F64, after: F64) -> F64:
     """How many times its former length each edge has, shape (E,)."""
     a, b = Connectivity.of(faces, len(before)).edges.T
     was, now = (np.linalg.norm(v[a] - v[b], axis=1) for v in (before, after))
-    return now / np.maximum(was, 1e-9)
+    found: F64 = now / np.maximum(was, 1e-9)
+    return found
 
 
 def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, notes: list[str]) -> FittedGarment:
@@ -281,7 +282,8 @@ def _few(weights: F64) -> F64:
     kept = weights.clip(0).copy()
     np.put_along_axis(kept, np.argsort(-kept, axis=1)[:, _INFLUENCES:], 0.0, axis=1)
     kept[kept < 2e-3] = 0.0
-    return kept / kept.sum(1, keepdims=True)
+    found: F64 = kept / kept.sum(1, keepdims=True)
+    return found
 
 
 def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:

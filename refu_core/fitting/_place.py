@@ -130,7 +130,8 @@ class Place:
 
     def __call__(self, vertices: F64) -> F64:
         """Vertices (V, 3) on the body [m]."""
-        return self.unit * vertices @ self.turn.T + self.shift
+        found: F64 = self.unit * vertices @ self.turn.T + self.shift
+        return found
 
 
 _UNDER_ARMS = 0.1

@@ -173,7 +173,8 @@ def _name_in(path: Path) -> str:
 def _rounded(tensor: torch.Tensor, bits: int) -> NDArray[np.float32]:
     """Rounds to multiples of 2^-bits: the insignificant bits become zeros, which compress to nothing."""
     scale = float(1 << bits)
-    return (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
+    found: NDArray[np.float32] = (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
+    return found
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:

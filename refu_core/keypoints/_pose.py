@@ -178,4 +178,5 @@ def log_so3(matrices: Array) -> Array:
 
 def skew(vectors: Array) -> Array:
     """Matrices (…, 3, 3) that multiply as the cross product with vectors (…, 3) does."""
-    return (vectors @ _CROSSES).reshape(*vectors.shape, 3)
+    matrices: Array = (vectors @ _CROSSES).reshape(*vectors.shape, 3)
+    return matrices

@@ -294,7 +294,8 @@ def _shortest(start: Array, end: Array) -> Array:
     if sine < 1e-9:  # the same direction, or the opposite one: any perpendicular axis will do
         axis = _unit(np.cross(a, np.eye(3)[np.abs(a).argmin()]))
     angle = np.arctan2(sine, cosine)
-    return exp_so3(_unit(axis)[None] * angle)[0]
+    turn: Array = exp_so3(_unit(axis)[None] * angle)[0]
+    return turn
 
 
 def _aligned(bone: Array, bend: Array, upper: Array, lower: Array) -> Array:
@@ -307,4 +308,5 @@ def _aligned(bone: Array, bend: Array, upper: Array, lower: Array) -> Array:
     across = _unit(bend - (bend @ first) * first)
     before = np.stack([first, across, np.cross(first, across)], axis=1)
     side = _unit(side)
-    return np.stack([along, side, np.cross(along, side)], axis=1) @ before.T
+    result: Array = np.stack([along, side, np.cross(along, side)], axis=1) @ before.T
+    return result

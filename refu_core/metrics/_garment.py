@@ -137,7 +137,8 @@ class FoldBands:
 
     def energies(self, vertices: Any) -> NDArray[np.float64]:
         """The energy of each band of vertices (V, ..., 3) [m], finest first [m^2], shape (4, ...)."""
-        return (self.split(vertices)[:-1] ** 2).sum(axis=(1, -1))
+        energies: NDArray[np.float64] = (self.split(vertices)[:-1] ** 2).sum(axis=(1, -1))
+        return energies
 
 
 class GarmentMetrics:

@@ -241,7 +241,8 @@ class ObservedCloth:
     @property
     def offset(self) -> F32:
         """The displacement that is added to the garment before it is posed [m], shape (V, 3)."""
-        return self._lift[:, None] * self._out
+        found: F32 = self._lift[:, None] * self._out
+        return found
 
     def place(self, vertices: F32) -> None:
         """Takes over where the garment's vertices are [m], shape (V, 3)."""
@@ -281,7 +282,8 @@ class ObservedCloth:
         lift = (along * self._out[corner]).sum(2)
         # A sparse product needs no copy of the rows that it gathers, which are as large as a processor's cache.
         ends = 3 * np.arange(m + 1, dtype=np.int32)
-        return csr_array((lift.ravel(), corner.ravel(), ends), shape=(m, len(blend))) @ self._fields
+        slopes: F32 = csr_array((lift.ravel(), corner.ravel(), ends), shape=(m, len(blend))) @ self._fields
+        return slopes
 
 
 def within(points: NDArray[np.floating], low: F32, high: F32) -> NDArray[np.bool_]:

@@ -158,13 +158,15 @@ class Observer:
 
 def _posed(blend: NDArray[np.float32], offset: NDArray[np.float32]) -> NDArray[np.float32]:
     """Displacements (V, 3) [m] after they are posed by the joints' blended rotations (V, 3, 3)."""
-    return np.einsum("vij,vj->vi", blend, offset)
+    moved: NDArray[np.float32] = np.einsum("vij,vj->vi", blend, offset)
+    return moved
 
 
 def _to_root(turn: RootTurn, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (N, 3) [m] after the inverse of a turn: as the root sees them."""
     rotation, shift = turn.rotation.cpu().double().numpy(), turn.shift.cpu().double().numpy()
-    return (points - shift) @ rotation
+    seen: NDArray[np.float64] = (points - shift) @ rotation
+    return seen
 
 
 def _finite(name: str, value: ArrayLike, ndim: int) -> NDArray[np.float64]:

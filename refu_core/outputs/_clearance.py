@@ -59,4 +59,5 @@ class Clearance:
         require_known(name, self._rings)
         ring = self._rings[name]
         points = as_points("the garment's vertices", vertices, len(ring.start) - 1, dtype=np.float32)
-        return self._sdf.clipped(torch.from_numpy(points), ring).distance.numpy()
+        distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), ring).distance.numpy()
+        return distance

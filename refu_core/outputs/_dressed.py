@@ -160,7 +160,8 @@ class DressedPerson:
 
     def turned(self, points: NDArray[Any]) -> NDArray[Any]:
         """Turns points (..., 3) that are relative to the body's origin from SMPL's axes into those of `rotation`."""
-        return points @ self.rotation.T.astype(points.dtype)
+        turned: NDArray[Any] = points @ self.rotation.T.astype(points.dtype)
+        return turned
 
     @cached_property
     def vertices(self) -> dict[str, NDArray[np.float32]]:

@@ -72,7 +72,8 @@ def rings_of(garment: GarmentTemplate) -> dict[str, Ring]:
 def newell(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The vector area of a closed polygon of points (K, 3) [m²], shape (3,)."""
     middle = points - points.mean(0)
-    return 0.5 * np.cross(middle, np.roll(middle, -1, axis=0)).sum(0)
+    area: NDArray[np.float64] = 0.5 * np.cross(middle, np.roll(middle, -1, axis=0)).sum(0)
+    return area
 
 
 def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
@@ -99,7 +100,8 @@ def _loops(faces: NDArray[np.int32]) -> Iterator[tuple[NDArray[np.intp], NDArray
 
 def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Length of the edge from each point of a closed polygon (K, 3) [m] to the next, shape (K,)."""
-    return np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    length: NDArray[np.float64] = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    return length
 
 
 def _parts(
@@ -221,7 +223,8 @@ def _along(ring: Ring, rest: NDArray[np.float64]) -> NDArray[np.float64]:
     wanted -= (wanted @ normal) * normal
     middle = points - ring.shares @ points
     spread = (ring.shares[:, None] * middle).T @ middle
-    return ring.shares * (middle @ np.linalg.pinv(spread, rcond=1e-4) @ wanted)
+    weight: NDArray[np.float64] = ring.shares * (middle @ np.linalg.pinv(spread, rcond=1e-4) @ wanted)
+    return weight
 
 
 def _frame(name: str, ring: Ring, along: NDArray[np.float64], points: NDArray[np.float64]) -> Opening:

@@ -112,7 +112,8 @@ def _drawn(sheet_points: Points, sheet: NDArray[np.int32], cloth: Points, faces:
 
 def _distance(way: Points) -> Points:
     """Lengths (N,) of vectors [m], at least `_TOUCHING`: the weights of differences."""
-    return np.maximum(np.linalg.norm(way, axis=1), _TOUCHING)
+    length: Points = np.maximum(np.linalg.norm(way, axis=1), _TOUCHING)
+    return length
 
 
 def _regress(take: csr_array, shapes: Points, goals: Points) -> None:
@@ -222,7 +223,8 @@ class PlannerMesh:
     def middle(self, vertices: Any) -> NDArray[np.float64]:
         """The sheet in the middle of the solid [m], shape (N / 2, 3), for `vertices` as `solid` takes them."""
         points = as_points("the garment's vertices", vertices, self._n_vertices)
-        return self._take @ points
+        sheet: NDArray[np.float64] = self._take @ points
+        return sheet
 
     def solid(self, vertices: Any) -> NDArray[np.float64]:
         """Vertices of the solid [m], shape (N, 3), to go with `faces`, for a garment's `vertices` (V, 3) [m].

@@ -50,7 +50,8 @@ class SigmaMap:
 
     def at(self, bend: float) -> NDArray[np.float32]:
         """σ in a pose bent this much [m], shape (V,), interpolated between the regions' middles to avoid jumps."""
-        return self.sigma * np.float32(np.interp(bend, self.bend, self.factor))
+        found: NDArray[np.float32] = self.sigma * np.float32(np.interp(bend, self.bend, self.factor))
+        return found
 
     @classmethod
     def unknown(cls, n_vertices: int) -> SigmaMap:
@@ -64,7 +65,8 @@ def bend_of(garment: GarmentTemplate, pose: NDArray[Any]) -> NDArray[np.float64]
     joints = [joint for joint in garment.card.joints if joint != 0]
     angle = np.linalg.norm(np.asarray(pose, np.float64)[..., joints, :], axis=-1)
     wrapped = np.remainder(angle + np.pi, 2 * np.pi) - np.pi  # a rotation of 350° is one of 10°
-    return np.sqrt((wrapped**2).sum(-1))
+    found: NDArray[np.float64] = np.sqrt((wrapped**2).sum(-1))
+    return found
 
 
 def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any]) -> SigmaMap:
@@ -254,4 +256,5 @@ def _right_jacobians(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     square = np.maximum(angle, 1e-3) ** 2
     first = np.where(angle < 1e-3, 0.5, (1 - np.cos(angle)) / square)
     second = np.where(angle < 1e-3, 1 / 6, (angle - np.sin(angle)) / (square * np.maximum(angle, 1e-3)))
-    return np.eye(3) - first * cross + second * (cross @ cross)
+    found: NDArray[np.float64] = np.eye(3) - first * cross + second * (cross @ cross)
+    return found

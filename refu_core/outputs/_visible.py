@@ -91,7 +91,8 @@ class PinholeCamera:
     @property
     def eye(self) -> NDArray[np.float64]:
         """Where the camera is in the meshes' axes [m], shape (3,)."""
-        return -self.rotation.T @ self.translation
+        place: NDArray[np.float64] = -self.rotation.T @ self.translation
+        return place
 
     def scaled(self, width: int) -> PinholeCamera:
         """The same view with another number of columns, and rows in proportion."""

@@ -79,7 +79,8 @@ class StepGraphs:
                 self._graphs[key] = graph  # the last one used
                 return graph(inputs)
         moved = {name: tensor.to(self._device) for name, tensor in inputs.items()}
-        return self._step(moved, numbers).cpu().numpy()
+        result: NDArray[np.float32] = self._step(moved, numbers).cpu().numpy()
+        return result
 
     def _captured(self, inputs: Mapping[str, Tensor], numbers: tuple[float, ...]) -> _Graph:
         while len(self._graphs) >= self._most:
@@ -106,4 +107,5 @@ class _Graph:
         self._host.copy_(self._captured.output, non_blocking=True)
         if self._captured.output.is_cuda:
             torch.cuda.current_stream(self._captured.output.device).record_event().synchronize()
-        return self._host.numpy().copy()
+        result: NDArray[np.float32] = self._host.numpy().copy()
+        return result

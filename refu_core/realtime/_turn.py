@@ -44,4 +44,5 @@ class RootTurn:
 
     def to_host(self, points: Tensor) -> NDArray[np.float32]:
         """The same, as an array on the host."""
-        return self(points).cpu().numpy()
+        seen: NDArray[np.float32] = self(points).cpu().numpy()
+        return seen

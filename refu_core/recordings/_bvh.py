@@ -148,7 +148,8 @@ def _placed(joints: list[_Joint], rows: Array) -> Array:
             above = turns[joint.parent]
             places[i] = places[joint.parent] + np.einsum("tij,tj->ti", above, way)
             turns[i] = above @ turn
-    return places.swapaxes(0, 1)
+    frames: Array = places.swapaxes(0, 1)
+    return frames
 
 
 def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: Proportions | None) -> Recording:

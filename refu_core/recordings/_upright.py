@@ -37,7 +37,8 @@ _UP = 0.5
 
 def _are_sound(roots: Array) -> NDArray[np.bool_]:
     """Which roots are small enough to compute with; NaN isn't."""
-    return np.abs(roots).max(axis=1) <= MAX_ANGLE
+    sound: NDArray[np.bool_] = np.abs(roots).max(axis=1) <= MAX_ANGLE
+    return sound
 
 
 def up_of_root(roots: Array) -> Array:

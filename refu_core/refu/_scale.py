@@ -97,7 +97,8 @@ class ScaleNet(nn.Module):
         """z, shape (B, M), of betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         if self.settings.kind == "distance":
             return betas[:, :0]
-        return self.h(scale_inputs(betas, pose, style))
+        z: Tensor = self.h(scale_inputs(betas, pose, style))
+        return z
 
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor, distance: Tensor) -> Tensor:
         """α, shape (R,), of vertices number `vertex` (R,) of bodies number `body` (R,) with features z (B, M).
@@ -118,7 +119,8 @@ class ScaleNet(nn.Module):
         # A pose far beyond training may overflow the networks; α = 1 is right to first order.
         usual = 1 - self.least
         bounded = torch.nan_to_num(raw + usual, nan=usual, posinf=_MAX_SCALE, neginf=-_MAX_SCALE)
-        return self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
+        alpha: Tensor = self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
+        return alpha
 
     def of_body(self, z: Tensor) -> VertexScale:
         """α as `Resolver` asks for it, for the one body whose feature is z, shape (M,) or (1, M)."""
@@ -186,7 +188,8 @@ class _CompactLatent(nn.Module):
         nn.init.ones_(self.projection.bias)
 
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor) -> Tensor:
-        return self.embedding[vertex] * self.projection(z)[body]
+        latent: Tensor = self.embedding[vertex] * self.projection(z)[body]
+        return latent
 
 
 def _shared_latent_size(m: int, n: int, settings: ScaleSettings) -> int:

@@ -38,7 +38,8 @@ def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, m
     deficit = margin - sample.distance[rows]
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     offset = (alpha * deficit).clamp(-MAX_DISPLACEMENT, MAX_DISPLACEMENT)
-    return points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
+    pushed: Tensor = points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
+    return pushed
 
 
 def pushed_rows(distance: Tensor, margin: float) -> Tensor:
@@ -52,7 +53,8 @@ def unit_direction(gradient: Tensor) -> Tensor:
     defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
     # Replacing it before normalising keeps NaN out of the branch that isn't taken, and so out of the derivative.
     usable = torch.where(defined, gradient, gradient.new_tensor(_UP))
-    return usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
+    direction: Tensor = usable / torch.linalg.vector_norm(usable, dim=-1, keepdim=True)
+    return direction
 
 
 def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float) -> None:

@@ -90,7 +90,8 @@ class SdfNetwork(nn.Module):
         h = self.activation(self.point(points) + condition[:, None])
         for number, layer in enumerate(self.layers, start=1):
             h = self.activation(layer(torch.cat((h, points.to(h.dtype)), -1) if number == self.config.skip else h))
-        return self.last(h)[..., 0]
+        distance: Tensor = self.last(h)[..., 0]
+        return distance
 
 
 def with_gradient(

@@ -73,7 +73,8 @@ def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
         taken[i] = taken.get(i, 0) | bit
         taken[j] = taken.get(j, 0) | bit
         colour[k] = bit.bit_length()
-    return pairs[np.argsort(colour, kind="stable")]
+    found: NDArray[np.int32] = pairs[np.argsort(colour, kind="stable")]
+    return found
 
 
 _Contacts = tuple[I32, F32, F32, F32]
@@ -143,7 +144,8 @@ class _Skin:
 def _squared_way(points: F32, before: F32) -> F32:
     """The square of the distance that each point has moved [m²], shape (N,)."""
     way = points - before
-    return (way * way).sum(1)
+    squared: F32 = (way * way).sum(1)
+    return squared
 
 
 class SimulatedCloth:
@@ -219,14 +221,16 @@ class SimulatedCloth:
     def _lengths(self, shape: F32) -> F32:
         """Lengths of the distance constraints in a shape (N, 3)."""
         ends = shape[self._ends]
-        return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+        length: F32 = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).astype(np.float32)
+        return length
 
     def _anchor_points(self, body: F32) -> F32:
         face, weights, offset = self._anchors
         a, b, c = body[self._body_faces[face]].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
-        return weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c + offset * normal
+        points: F32 = weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c + offset * normal
+        return points
 
     def frame(self, body_from: F32, body_to: F32, *, gravity: F32, drag: float, careful: bool = False) -> float:
         """Simulates `settings.substeps` time steps while the body moves straight from one mesh (V, 3) to the other.

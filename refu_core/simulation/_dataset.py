@@ -175,7 +175,8 @@ class _Finished:
         """
         if name not in self._columns:
             raise SimulationError(f"wanted one of the columns {', '.join(sorted(self._columns))}, got {name!r}")
-        return self._columns[name][self._rows]
+        found: NDArray[Any] = self._columns[name][self._rows]
+        return found
 
     def _row(self, index: int) -> tuple[dict[str, Any], str]:
         """The columns of one row, and its split. Raises `SimulationError` when there is no such row."""

@@ -219,7 +219,8 @@ class Draper:
 
     def rest(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> F32:
         """The garment cut for this shape and style [m], shape (N, 3): its edges are the cloth's rest lengths."""
-        return self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
+        rest: F32 = self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
+        return rest
 
     def bodies(self, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
         """What cloth lies on: the colliders of poses (P, 24, 3) [rad] and a shape (10,) [m], shape (P, V, 3)."""
@@ -306,4 +307,5 @@ class Draper:
 
     def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
-        return np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
+        turned: F32 = np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
+        return turned

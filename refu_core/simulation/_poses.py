@@ -126,7 +126,8 @@ def without_heading(pose: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def mirrored(pose: NDArray[np.floating]) -> NDArray[np.float32]:
     """The pose (24, 3) of the mirror image, left and right exchanged [rad]."""
-    return np.asarray(pose, np.float32)[MIRRORED_JOINTS,] * np.array([1, -1, -1], np.float32)
+    image: NDArray[np.float32] = np.asarray(pose, np.float32)[MIRRORED_JOINTS,] * np.array([1, -1, -1], np.float32)
+    return image
 
 
 def random_pose(rng: np.random.Generator) -> NDArray[np.float32]:
@@ -207,7 +208,8 @@ _STIFF = tuple(JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right")
 
 def posture(name: str) -> NDArray[np.float32]:
     """One of `POSTURES`, rotation vectors [rad], shape (24, 3). Raises `KeyError` for another name."""
-    return np.radians(posed(POSTURES[name])).astype(np.float32)
+    pose: NDArray[np.float32] = np.radians(posed(POSTURES[name])).astype(np.float32)
+    return pose
 
 
 def drawn_posture(rng: np.random.Generator, names: Sequence[str]) -> tuple[NDArray[np.float32], int]:

@@ -55,7 +55,8 @@ class DrawnMotion:
         smooth = gaussian_filter1d(self.transl, _SMOOTH, axis=0, mode="nearest")
         second = np.gradient(np.gradient(smooth, axis=0), axis=0) * (FPS * STEPS) ** 2
         size = np.linalg.norm(second, axis=1, keepdims=True)
-        return second * np.minimum(1, _MOST_ACCELERATION / np.maximum(size, 1e-9))
+        limited: NDArray[np.float64] = second * np.minimum(1, _MOST_ACCELERATION / np.maximum(size, 1e-9))
+        return limited
 
 
 def n_steps(n_frames: int) -> int:

@@ -79,7 +79,8 @@ def quantise(vertices: NDArray[np.floating]) -> NDArray[np.int16]:
 
 def dequantise(units: NDArray[np.int16]) -> NDArray[np.float32]:
     """Positions [m] of stored units; exact."""
-    return units.astype(np.float32) * np.float32(QUANTUM)
+    metres: NDArray[np.float32] = units.astype(np.float32) * np.float32(QUANTUM)
+    return metres
 
 
 def has_rows(output: Path) -> bool:
@@ -178,7 +179,8 @@ def read_card(directory: Path, *kinds: str) -> dict[str, Any]:
     if got not in kinds:
         msg = f"{path}: wanted the card of a data set of the format {' or '.join(kinds)}, got the format {got!r}"
         raise SimulationError(msg)
-    return card
+    found: dict[str, Any] = card
+    return found
 
 
 def write_card(directory: Path, card: dict[str, Any]) -> None:

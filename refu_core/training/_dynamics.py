@@ -126,7 +126,8 @@ def train_dynamics(
     def predict(x: Tensor, s: Tensor, past: Tensor) -> Tensor:
         if dynamics.training:
             past = past + settings.noise * torch.randn_like(past)
-        return dynamics(x, s, past)
+        code: Tensor = dynamics(x, s, past)
+        return code
 
     objective = Objective([dynamics], predict, code_loss(still))
     loop.run(TrainingStage("dynamics", objective, settings.steps, train, validation))
@@ -187,7 +188,8 @@ def _figures(
     """MPVE on the test sequences [mm]: with dynamics, without, and the least that the basis allows."""
 
     def predicted(pose: Tensor, style_shape: Tensor, owed: Tensor) -> Tensor:
-        return still.decoder(still.code(still.features(pose), style_shape) + owed)
+        displacement: Tensor = still.decoder(still.code(still.features(pose), style_shape) + owed)
+        return displacement
 
     moved = in_chunks(dynamics, *prepared[:3])
     owed = {"mpve_mm": moved, "still_mm": torch.zeros_like(moved), "basis_mm": prepared.code}

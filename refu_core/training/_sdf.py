@@ -146,7 +146,8 @@ def sdf_loss(distance: Tensor, gradient: Tensor, batch: SdfBatch) -> Tensor:
     value = (distance - batch.distance).abs().mean()
     normal = (gradient[:, :on_surface] - batch.normals).norm(dim=-1).mean()
     eikonal = (gradient[:, on_surface:].norm(dim=-1) - 1).square().mean()
-    return VALUE_WEIGHT * value + NORMAL_WEIGHT * normal + EIKONAL_WEIGHT * eikonal
+    loss: Tensor = VALUE_WEIGHT * value + NORMAL_WEIGHT * normal + EIKONAL_WEIGHT * eikonal
+    return loss
 
 
 @torch.no_grad()

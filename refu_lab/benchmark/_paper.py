@@ -124,4 +124,5 @@ class PaperStructure:
     def _alpha(self, betas: Tensor, pose: Tensor, distance: Tensor) -> Tensor:
         z = self._scale.feature(betas.to(self._dtype), pose.to(self._dtype), None)
         latent = torch.relu(self._k(z)).view(len(distance), -1)
-        return self._scale.g(torch.cat((latent, distance[:, None].to(self._dtype)), 1))[:, 0].float()
+        alpha: Tensor = self._scale.g(torch.cat((latent, distance[:, None].to(self._dtype)), 1))[:, 0].float()
+        return alpha

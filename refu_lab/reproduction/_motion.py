@@ -212,7 +212,8 @@ class OutfitJudge:
     def _edge_lengths(self, garment: str, vertices: NDArray[np.floating]) -> NDArray[np.floating]:
         """Length of each edge [m], shape (E,)."""
         a, b = vertices[self._skinned.garments[garment].mesh.edges.T]
-        return np.linalg.norm(a - b, axis=1)
+        lengths: NDArray[np.floating] = np.linalg.norm(a - b, axis=1)
+        return lengths
 
     def judge(self, frames: Sequence[SmplFrame]) -> tuple[dict[tuple[str, str], Judged], NDArray[np.floating]]:
         """Judges the first of two frames, by (garment, method); and how far its skin was moved [m], shape (V,)."""

@@ -111,7 +111,8 @@ def _denormal(rng: np.random.Generator) -> SmplFrame:
     tiny = np.float64(np.finfo(np.float32).smallest_subnormal)
 
     def draw(*shape: int) -> NDArray[np.float64]:
-        return tiny * rng.integers(-1000, 1000, shape)
+        numbers: NDArray[np.float64] = tiny * rng.integers(-1000, 1000, shape)
+        return numbers
 
     return frame_of(draw(N_JOINTS, 3), betas=draw(N_BETAS), transl=draw(3), style=draw(N_STYLES))
 

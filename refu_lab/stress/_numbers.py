@@ -76,7 +76,8 @@ def _on_edges(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
 
 
 def _mixed(vertices: F32, faces: I64, weights: F64) -> F64:
-    return (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
+    mixed: F64 = (vertices[faces].astype(np.float64) * weights[..., None]).sum(1)
+    return mixed
 
 
 def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
@@ -95,7 +96,8 @@ def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
         points = torch.from_numpy((start + middle[:, None] * inward).astype(np.float32))
         is_under = sdf.query(points).distance.abs().numpy() >= middle - 1e-6
         low, high = np.where(is_under, middle, low), np.where(is_under, high, middle)
-    return start + ((low + high) / 2)[:, None] * inward
+    halfway: F64 = start + ((low + high) / 2)[:, None] * inward
+    return halfway
 
 
 def _hair(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:

@@ -70,7 +70,8 @@ class DressedFilm:
     @property
     def times(self) -> NDArray[np.float64]:
         """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
-        return self._moments - self._moments[0]
+        times: NDArray[np.float64] = self._moments - self._moments[0]
+        return times
 
     @property
     def front(self) -> float:
