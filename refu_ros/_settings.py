@@ -88,7 +88,7 @@ class NodeSettings(DressOptions):
     max_distance: float = setting(
         0.0, "People farther from the origin of frame_id aren't dressed [m]; 0: no limit.", within=(0.0, 1e6)
     )
-    record: str = setting("", "Directory that inputs and outputs are recorded to as a bag; empty for none.")
+    record: str = setting("", "Directory of a bag that inputs, garments and diagnostics are recorded to; empty: none.")
     record_sync_period: float = fixed(
         1.0, "The most that a power cut can take from a recording [s]; 0: no promise.", within=(0.0, 3600.0)
     )
