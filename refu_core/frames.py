@@ -38,7 +38,10 @@ PLAUSIBLE_TRANSL = 1e9
 def checked_numbers(
     name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floating[Any]], limit: float = np.inf
 ) -> NDArray[Any]:
-    """`value` as a read-only array of numbers up to `limit`; accepts any layout with the right number of elements."""
+    """`value` as a read-only array of this shape; it may have it already, or be flat. No number exceeds `limit`.
+
+    Raises `FrameError` for anything else, naming it `name`.
+    """
     try:
         given = np.ma.asanyarray(value) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
         if given.dtype.kind not in "iufO":  # NumPy also turns booleans, text, dates and complex ones into numbers

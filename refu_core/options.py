@@ -196,13 +196,13 @@ class DressOptions(PipelineOptions):
     )
     betas: tuple[float, ...] = setting(
         (0.0,) * N_BETAS,
-        "Shape of everybody in standard deviations, where betas_source is fixed; commands take --betas as that.",
+        "Everybody's shape in standard deviations, if betas_source is fixed; --betas of a command implies that.",
         within=(-20.0, 20.0),
         metavar="B0,…",
     )
     betas_source: str = setting(
         "message",
-        "message: betas that arrive are of body or betas_from; builtin: of the built-in body; fixed: parameter betas.",
+        "Whose betas arrive: message (those of body or betas_from), builtin, or fixed (ignored; betas are used).",
         choices=tuple(BetasSource),
     )
 

@@ -37,40 +37,42 @@ class NodeSettings(DressOptions):
     Raises `SettingsError` for a value out of range and for values that can't go together.
     """
 
-    threads: int = fixed(2, "Frames, or people of a frame, processed at once; on a GPU people alone.", within=(1, 64))
+    threads: int = fixed(
+        2, "Frames, or people of a frame, processed at the same time; on a GPU only people.", within=(1, 64)
+    )
     on_device_loss: str = setting(
-        "cpu", "When the device fails: go on on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
+        "cpu", "When the device fails: continue on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
     )
     input_type: str = fixed(
         "multiarray", "Message type and layout of smpl_params.", choices=(*INPUT_TYPES, *KEYPOINT_TYPES)
     )
     keypoints: str = setting(
-        "zed38", "Which points of the body the tracker sends, where input_type is of keypoints.", choices=LAYOUTS
+        "zed38", "Which points of the body the tracker sends, if input_type is one of keypoints.", choices=LAYOUTS
     )
     keypoint_rate: float = fixed(
-        0.0, "Poses of keypoints, predicted, so many a second; 0 for one a message [Hz].", within=(0.0, 240.0)
+        0.0, "Rate of poses predicted from keypoints [Hz]; 0: one per message.", within=(0.0, 240.0)
     )
     keypoint_smoothing: float = setting(
-        1.0, "How much smoother than people usually move poses of keypoints are: 2 is later.", within=(0.1, 10.0)
+        1.0, "For poses from keypoints: 2 is smoother and later, 0.5 is quicker.", within=(0.1, 10.0)
     )
     input_axes: str = setting(
         "smpl", "Axes of the root: smpl (y up; turned into ROS axes) or frame (those of frame_id).", choices=AXES
     )
-    frame_id: str = setting(WORLD_FRAME, "Frame of all that comes out; inputs of other frames are transformed (tf2).")
+    frame_id: str = setting(WORLD_FRAME, "Frame of all outputs; inputs in other frames are transformed to it (tf2).")
     transform_tolerance: float = setting(
         0.1,
-        "An input waits so long for its transform, and then takes one as much older [s]; or is dropped.",
+        "How long an input waits for its transform, and how much older a transform may be after that [s].",
         within=(0.0, 10.0),
     )
     points_fields: tuple[str, ...] = setting(
-        POINT_FIELDS, f"What the points have besides x, y and z: of {', '.join(POINT_FIELDS)}."
+        POINT_FIELDS, f"Fields of the points besides x, y and z: {', '.join(POINT_FIELDS)}."
     )
     camera_info: str = fixed("", "A camera's CameraInfo topic: points then say whether it sees them; empty for none.")
     planner_rate: float = setting(
-        5.0, "Meshes for planners: at most so many a second of each garment; 0 for no limit [Hz].", within=(0.0, 1e3)
+        5.0, "Highest rate of each garment's mesh for planners [Hz]; 0: no limit.", within=(0.0, 1e3)
     )
     publish_tf: bool = fixed(
-        False, "Whether openings are frames on /tf, too; whoever listens there is then a reason to compute."
+        False, "Also publish openings as frames on /tf; then any listener there is a reason to compute."
     )
     persons: tuple[str, ...] = fixed(
         ("",), "Persons, each with a topic <person>/smpl_params; one without a name listens to smpl_params."
@@ -78,24 +80,20 @@ class NodeSettings(DressOptions):
     follow_humans: bool = fixed(
         False, "Dress everybody with a topic /humans/bodies/<id>/joint_states (REP-155); needs joint_state."
     )
-    person_timeout: float = setting(
-        1.0, "A person who hasn't sent for so long leaves the scene [s].", within=(0.05, 3600.0)
-    )
-    max_rate: float = setting(0.0, "At most so many frames a second; 0 for no limit [Hz].", within=(0.0, 1e3))
+    person_timeout: float = setting(1.0, "A person silent for this long leaves the scene [s].", within=(0.05, 3600.0))
+    max_rate: float = setting(0.0, "Most frames a second [Hz]; 0: no limit.", within=(0.0, 1e3))
     marker_lifetime: float = setting(
-        2.0, "Viewers drop a garment that isn't renewed for so long; 0 for never [s].", within=(0.0, 1e6)
+        2.0, "Viewers drop a garment that isn't renewed for this long [s]; 0: never.", within=(0.0, 1e6)
     )
     max_distance: float = setting(
-        0.0, "A person farther from the origin of frame_id isn't dressed; 0 for no limit [m].", within=(0.0, 1e6)
+        0.0, "People farther from the origin of frame_id aren't dressed [m]; 0: no limit.", within=(0.0, 1e6)
     )
-    record: str = setting("", "Directory that inputs and outputs are recorded to as a bag; empty for none.")
+    record: str = setting("", "Directory of a bag that inputs, garments and diagnostics are recorded to; empty: none.")
     record_sync_period: float = fixed(
-        1.0, "A power cut takes no more than so much of a recording; 0 for no promise [s].", within=(0.0, 3600.0)
+        1.0, "The most that a power cut can take from a recording [s]; 0: no promise.", within=(0.0, 3600.0)
     )
-    bags: str = fixed("", "Folder that requests may name bags in (refu_msgs); empty: they may name none.")
-    lazy: bool = fixed(
-        True, "Whether the inputs are subscribed to only while somebody wants the output, or it is recorded."
-    )
+    bags: str = fixed("", "Folder that requests (refu_msgs) may name bags in; empty: none.")
+    lazy: bool = fixed(True, "Subscribe to the inputs only while an output has a subscriber, or is recorded.")
     autostart: bool = fixed(True, "Whether the node configures and activates itself.")
 
     def __post_init__(self) -> None:

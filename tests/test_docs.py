@@ -12,6 +12,7 @@ import yaml
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md")])
+CODE = [path for name in ("refu_core", "msg_adapters", "refu_ros", "refu_lab") for path in (ROOT / name).rglob("*.py")]
 
 
 def places() -> list[str]:
@@ -56,15 +57,13 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in headings(path), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_named_files_exist(page: Path) -> None:
-    if page.name == "CHANGELOG.md":
-        return  # it tells of files that were
-    named = re.findall(
-        r"`((?:docs|tests|examples|scripts|benchmarks|config|refu_\w+|msg_adapters)/[\w/.-]+\.\w+)[:`]",
-        page.read_text(encoding="utf-8"),
-    )
-    assert [name for name in named if not (ROOT / name).exists()] == []
+def test_named_files_exist() -> None:
+    pages = [page for page in PAGES if page.name != "CHANGELOG.md"]  # it tells of files that were
+    folders = "docs|tests|examples|scripts|benchmarks|config|refu_\\w+|msg_adapters"
+    place = rf"(?<![\w/.-])((?:{folders})/[\w/.-]+\.\w+)"
+    named = {(path, name) for path in (*pages, *CODE) for name in re.findall(place, path.read_text(encoding="utf-8"))}
+    assert len(named) > 100
+    assert [f"{path}: {name}" for path, name in sorted(named) if not (ROOT / name).exists()] == []
 
 
 def test_navigation_names_every_page() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 from itertools import islice
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from outside_meshes import Outside, quads_of_a_skirt, write_obj
 
-from msg_adapters import BagReader, BagWriter
+from msg_adapters import BagReader, BagWriter, read_motion
 
 ROOT = Path(__file__).parents[1]
 
@@ -26,7 +27,7 @@ def shorten(bag: Path, to: Path) -> None:
             part.write(message.topic, message.data, log_time_ns=message.log_time_ns)
 
 
-@pytest.mark.parametrize("page", ["python", "garments", "outputs"])
+@pytest.mark.parametrize("page", ["python", "garments", "outputs", "inputs"])
 def test_a_pages_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (ROOT / "docs" / "guide" / f"{page}.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
@@ -35,6 +36,9 @@ def test_a_pages_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.Monk
     shorten(ROOT / "bags" / "walk", tmp_path / "bags" / "walk")
     write_obj(tmp_path / "kilt.obj", Outside(*quads_of_a_skirt(16, 50)))
     np.savez(tmp_path / "clip.npz", poses=np.zeros((3, 72)), trans=np.zeros((3, 3)), mocap_framerate=30.0)
+    (tmp_path / "output" / "smpl").mkdir(parents=True)
+    person = {name: [[0.0] * size] for name, size in (("Rh", 3), ("Th", 3), ("poses", 72), ("shapes", 10))}
+    (tmp_path / "output" / "smpl" / "000000.json").write_text(json.dumps([person]), encoding="utf-8")
     (tmp_path / "page.py").write_text("\n".join(blocks), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     names = runpy.run_path("page.py")
@@ -45,6 +49,9 @@ def test_a_pages_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.Monk
     elif page == "outputs":
         assert np.abs(names["out"]["short-pant-male"].vertices - names["mesh"].vertices).max() < 0.002
         assert names["openings"].names == ("waist", "left_leg", "right_leg")
+    elif page == "inputs":
+        assert names["frame"] is None
+        assert len(read_motion("clip.npz")) == 1  # what the page makes of EasyMocap's files
     else:
         assert names["pipeline"].untrained == ("kilt",)
         assert (tmp_path / "kilt.npz").exists()

@@ -30,7 +30,8 @@ def up_in_root(pose: Tensor) -> Tensor:
 
 
 SEEN_TILT = (np.radians(40), np.radians(60))
-"""No training clip tilts the pelvis beyond the first of these [rad], and networks are told of none beyond the second.
+"""No recorded motion of the training tilts the pelvis beyond the first of these [rad]; lying postures do, but networks
+are told of no tilt beyond the second.
 On a lying person, a skirt was off by 30 to 46 mm and a T-shirt by 15 to 23; with this, by 32 to 44 and 12 to 18."""
 _MOST_TILT = 0.5  # the cosine of the second
 

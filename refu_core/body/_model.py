@@ -207,12 +207,18 @@ class SmplBody:
         return tensor.reshape(-1, *width)
 
     def rest_joints(self, betas: Tensor) -> Tensor:
-        """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10)."""
+        """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10).
+
+        Raises `FrameError` for anything but a tensor.
+        """
         require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
         return self.joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
-        """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10)."""
+        """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10).
+
+        Raises `FrameError` for anything but a tensor.
+        """
         require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
         return torch.addmm(self.v_template.view(1, -1), betas, self._shapedirs).view(-1, self.n_vertices, 3)
 
@@ -251,7 +257,10 @@ class SmplBody:
         return Shape(self.rest_vertices(betas), self.rest_joints(betas))
 
     def posed(self, pose: Tensor, shape: Shape) -> BodyOutput:
-        """Poses bodies by rotation vectors (B, 24, 3) [rad]; `shape` has as many bodies, or one for all."""
+        """Poses bodies by rotation vectors (B, 24, 3) [rad]; `shape` has as many bodies, or one for all.
+
+        Raises `FrameError` for anything but a tensor.
+        """
         require_type(pose, Tensor, _TENSOR.format("pose"), error=FrameError)
         rotations = rotvec_to_rotmat(pose)
         joints, transforms = forward_kinematics(rotations, shape.joints)

@@ -205,6 +205,6 @@ class DressedPerson:
         return self.fittings.contacts(self.output)
 
     def solid(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """A garment as planners take it: vertices [m] and faces."""
+        """A garment as planners take it: vertices (N, 3) [m] and faces (T, 3)."""
         planner = self.fittings.planner(name)
         return planner.solid(self.vertices[name]), planner.faces

@@ -48,13 +48,13 @@ def up_of_root(roots: Array) -> Array:
 
 
 def upright_share(roots: Array) -> float:
-    """Share of frames, 0 to 1, in which a person is upright in SMPL's axes; 1 if no frame is finite."""
+    """Share of frames, 0 to 1, with roots (T, 3) [rad] upright in SMPL's axes; 1 if no frame is finite."""
     roots = roots[_are_sound(roots)]
     return float((up_of_root(roots)[:, 1] > _UP).mean()) if len(roots) else 1.0
 
 
 def axis_of(roots: Array) -> str:
-    """The axis that people stand along, such as `+y`; empty if none is clear."""
+    """The axis that people stand along by their roots (T, 3) [rad], such as `+y`; empty if none is clear."""
     roots = roots[_are_sound(roots)]
     if not len(roots):
         return ""

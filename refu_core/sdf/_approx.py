@@ -57,7 +57,7 @@ class ApproxSdf(MeshSdf):
 
     So the distance is always that to a face of the posed body: exact, or too large where no walk ended at the closest
     face. Sign, gradient and derivatives are those of `ExactSdf`. Within 2 cm of the skin the mean error is some
-    hundredths of a millimetre, at less than a fifth of the exact query's cost (benchmarks/sdf.py).
+    hundredths of a millimetre, at less than a fifth of the exact query's cost (`refu_lab/benchmark/_sdfs.py`).
     """
 
     is_exact = False

@@ -78,7 +78,7 @@ def quantise(vertices: NDArray[np.floating]) -> NDArray[np.int16]:
 
 
 def dequantise(units: NDArray[np.int16]) -> NDArray[np.float32]:
-    """Positions [m] of stored units; exact."""
+    """Positions [m] of stored units of any shape; exact."""
     metres: NDArray[np.float32] = units.astype(np.float32) * np.float32(QUANTUM)
     return metres
 

@@ -57,7 +57,10 @@ class Weights:
 
 
 def weights_folder(garment: str, root: str | os.PathLike[str] | None = None) -> Path:
-    """The folder of a garment's weights below `root`, or of those that ship; it needn't exist."""
+    """The folder of a garment's weights below `root`, or of those that ship; it needn't exist.
+
+    Raises `WeightsError` for a `root` that is no path.
+    """
     require_type(root, (str, os.PathLike, NoneType), "a folder of weights", error=WeightsError)
     return (Path(__file__).parent if root is None else Path(root)) / garment
 

@@ -33,7 +33,7 @@ class SimulateOptions:
     postures: float = setting(
         0.0,
         "share of poses that are everyday postures which recordings lack: arms crossed, overhead, sitting, kneeling, "
-        "on all fours",
+        "lying, kicks, lunges",
         parse=cli.between(0.0, 1.0),
         metavar="SHARE",
     )

@@ -135,8 +135,11 @@ def test_config_says_what_is_what_and_what_is_live() -> None:
 
 def test_documented_parameters() -> None:
     text = (ROOT / "docs" / "guide" / "ros.md").read_text(encoding="utf-8")
-    rows = set(re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE))
-    assert set(SPECS) <= rows
+    rows = re.findall(r"^\| `(\w+)` \| (?:`(.*?)`|zeros|all six) \| (yes|no) \|", text, flags=re.MULTILINE)
+    assert {name: live == "yes" for name, _, live in rows} == {name: spec.live for name, spec in SPECS.items()}
+    given = {name: yaml.safe_load(default) for name, default, _ in rows if default}
+    defaults = {name: list(s.default) if isinstance(s.default, tuple) else s.default for name, s in SPECS.items()}
+    assert given == {name: defaults[name] for name in given}
 
 
 @pytest.mark.parametrize("path", LAUNCH_FILES, ids=lambda path: path.name)
