@@ -202,7 +202,7 @@ def read_samples(
     check_set(dataset, body, garment)
     rows = np.flatnonzero(dataset.train if split == "train" else dataset.test)
     if not len(rows):
-        msg = f"the set of {garment.name} has no finished sample to {split} on: let `refu simulate` run longer"
+        msg = f"the set of {garment.name} has no finished sample to {split} on: finish it, or make a larger one"
         raise RefuError(msg)
     if isinstance(dataset, GarmentSequences):
         stored = _frames(dataset, rows)

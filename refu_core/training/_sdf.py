@@ -253,7 +253,7 @@ def _split(dataset: GarmentDataset, settings: SdfSettings) -> dict[str, Tensor]:
     splits = {"train": train & ~held_out, "validation": train & held_out, "test": test}
     for name, mask in splits.items():
         if not bool(mask.any()):
-            raise RefuError(f"the set has no finished sample for the {name} part: let `refu simulate` run longer")
+            raise RefuError(f"the set has no finished sample for its {name} part: finish it, or make a larger one")
     return {name: torch.nonzero(mask)[:, 0] for name, mask in splits.items()}
 
 
