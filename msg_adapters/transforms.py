@@ -183,14 +183,13 @@ class TransformBuffer:
         """Takes a transform, or returns why not."""
         parent, child = one.parent.lstrip("/"), one.child.lstrip("/")
         value = np.concatenate([np.asarray(one.translation, np.float64), np.asarray(one.quaternion, np.float64)])
-        length = float(np.linalg.norm(value[3:]))
         if not parent or not child or parent == child:
             return "which aren't two frames"
         if max(len(parent), len(child)) > _LONGEST_NAME:
             return f"whose names are longer than {_LONGEST_NAME} characters"
         if not (np.abs(value) <= PLAUSIBLE_TRANSL).all():
             return f"which has numbers that aren't finite or beyond {PLAUSIBLE_TRANSL:g}"
-        if abs(length - 1.0) > _UNIT_TOLERANCE:
+        if abs((length := float(np.linalg.norm(value[3:]))) - 1.0) > _UNIT_TOLERANCE:
             return f"which is no rotation: wanted a quaternion of length 1, got {length:.3g}"
         if child not in self._tracks and self.is_full:
             return f"which would be more than {len(self)} frames"

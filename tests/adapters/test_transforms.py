@@ -143,6 +143,7 @@ def test_what_makes_no_sense_is_left_out_and_counted() -> None:
         transform("map", "cam", quaternion=np.array([0, 0, 0, 2.0])),
         transform("map", "cam", translation=np.array([np.nan, 0, 0])),
         transform("map", "cam", translation=np.array([0, 1e300, 0])),
+        transform("map", "cam", quaternion=np.array([0, 0, 0, 1e300])),
     ]
     assert put(buffer, *bad) == len(bad)
     assert len(buffer) == 0
