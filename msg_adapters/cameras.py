@@ -12,6 +12,8 @@ from msg_adapters.errors import DecodeError
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _MOST_PIXELS = 1 << 15
 """Largest width or height of a picture: what the camera sees is drawn into one, which has to fit into memory."""
+_LARGEST = 1e9
+"""Largest focal length, and distance to the centre [pixels]: with more, places in the picture overflow float32."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ def decode_camera_info(data: Buffer) -> Camera:
     reader.finish()
     focal, centre = (float(k[0]), float(k[4])), (float(k[2]) + 0.5, float(k[5]) + 0.5)
     sizes = 0 < width <= _MOST_PIXELS and 0 < height <= _MOST_PIXELS
-    if not (np.isfinite(k[:9]).all() and min(focal) > 0 and sizes):
+    if not ((np.abs(k[:9]) <= _LARGEST).all() and min(focal) > 1 / _LARGEST and sizes):
         msg = f"the camera in {frame_id!r} isn't calibrated: {width} x {height} pixels, focal lengths {focal}"
         raise DecodeError(msg)
     return Camera(frame_id.lstrip("/"), width, height, focal, centre)

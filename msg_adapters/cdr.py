@@ -24,6 +24,9 @@ _BYTE_ORDERS = {0: ">", 1: "<"}
 _PRIMITIVES = {order + code: struct.Struct(order + code) for order in "<>" for code in "?BbiIfd"}
 # RTPS pads payloads to a multiple of 4; rclpy's serialize_message leaves up to 12 unused bytes after empty sequences.
 _MAX_TRAILING = 15
+MOST_ITEMS = 10_000
+"""The most strings, transforms or markers in a sequence. They are read one by one: ten megabytes of them took up to
+seven seconds, in which a node does nothing else."""
 
 
 class CdrReader:
@@ -100,6 +103,13 @@ class CdrReader:
             )
         return int(count)
 
+    def items(self, *, item_bytes: int) -> range:
+        """A number for each item of a sequence that is read item by item."""
+        count = self.length(item_bytes=item_bytes)
+        if count > MOST_ITEMS:
+            raise DecodeError(f"wanted up to {MOST_ITEMS} items in a sequence, got {count}")
+        return range(count)
+
     def string(self) -> str:
         """A string: its length including the final NUL, then the bytes in UTF-8."""
         raw = self.skip(self.length(item_bytes=1))
@@ -114,7 +124,7 @@ class CdrReader:
 
     def strings(self) -> list[str]:
         """A sequence of strings."""
-        return [self.string() for _ in range(self.length(item_bytes=4))]
+        return [self.string() for _ in self.items(item_bytes=4)]
 
     def array(self, kind: str, count: int) -> NDArray[Any]:
         """A read-only view of `count` numbers of a numpy kind ("f4", "f8") in the byte order of the message."""

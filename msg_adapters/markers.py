@@ -315,7 +315,7 @@ def decode_marker_array(data: Buffer) -> list[Marker]:
     Raises `DecodeError` for anything that isn't one.
     """
     reader = CdrReader(data)
-    markers = [_marker(reader) for _ in range(reader.length(item_bytes=_MIN_MARKER_BYTES))]
+    markers = [_marker(reader) for _ in reader.items(item_bytes=_MIN_MARKER_BYTES)]
     reader.finish()
     return markers
 

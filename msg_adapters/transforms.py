@@ -20,6 +20,8 @@ HISTORY_NS = 10 * 10**9
 """How far back transforms are kept, as in tf2 [ns]."""
 _MOST_FRAMES = _MOST_STAMPS = 10_000
 """The most frames in all, and the most stamps of one frame within the history: both are up to the sender."""
+_LONGEST_NAME = 255
+"""Of a frame [characters], as in the node's parameter: names of a megabyte each would fill the memory."""
 _LONGEST_WAY = 100
 """Longest chain of parents. Robots have a few dozen; the chain is followed anew for each input."""
 _UNIT_TOLERANCE = 1e-2
@@ -67,7 +69,7 @@ def decode_transforms(data: Buffer) -> list[Transform]:
     """The transforms of a `tf2_msgs/TFMessage`. Raises `DecodeError` for anything that isn't one."""
     reader = CdrReader(data)
     found = []
-    for _ in range(reader.length(item_bytes=_MIN_TRANSFORM_BYTES)):
+    for _ in reader.items(item_bytes=_MIN_TRANSFORM_BYTES):
         stamp_ns, parent, child = reader.fields("Tss")
         numbers = reader.array("f8", 7)
         found.append(Transform(stamp_ns, parent, child, numbers[:3], numbers[3:]))
@@ -181,12 +183,13 @@ class TransformBuffer:
         """Takes a transform, or returns why not."""
         parent, child = one.parent.lstrip("/"), one.child.lstrip("/")
         value = np.concatenate([np.asarray(one.translation, np.float64), np.asarray(one.quaternion, np.float64)])
-        length = float(np.linalg.norm(value[3:]))
         if not parent or not child or parent == child:
             return "which aren't two frames"
+        if max(len(parent), len(child)) > _LONGEST_NAME:
+            return f"whose names are longer than {_LONGEST_NAME} characters"
         if not (np.abs(value) <= PLAUSIBLE_TRANSL).all():
             return f"which has numbers that aren't finite or beyond {PLAUSIBLE_TRANSL:g}"
-        if abs(length - 1.0) > _UNIT_TOLERANCE:
+        if abs((length := float(np.linalg.norm(value[3:]))) - 1.0) > _UNIT_TOLERANCE:
             return f"which is no rotation: wanted a quaternion of length 1, got {length:.3g}"
         if child not in self._tracks and self.is_full:
             return f"which would be more than {len(self)} frames"

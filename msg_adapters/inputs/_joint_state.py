@@ -170,7 +170,7 @@ def body_of(data: Buffer) -> str | None:
     """The id of the ROS4HRI body in a message that could be decoded; None if its joints are SMPL's."""
     reader, names = CdrReader(data), []
     reader.fields("Ts")
-    for _ in range(reader.length(item_bytes=4)):
+    for _ in reader.items(item_bytes=4):
         names.append(reader.string())
         if names[-1] in _SLOTS:  # usually the first one already is
             return None

@@ -19,11 +19,14 @@ from msg_adapters import (
     INPUT_TYPES,
     DecodeError,
     EncodeError,
+    decode_ids,
+    decode_marker_array,
     decoder_for,
     encoder_for,
     message_definition,
 )
-from msg_adapters.cdr import CdrReader, CdrWriter
+from msg_adapters.cdr import MOST_ITEMS, CdrReader, CdrWriter
+from msg_adapters.transforms import decode_transforms
 from refu_core import SmplFrame
 from refu_core.skeleton import JOINT_NAMES
 
@@ -356,6 +359,19 @@ def test_absurd_lengths_allocate_nothing() -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 20
+
+
+@pytest.mark.parametrize(
+    "decode",
+    [decoder_for("joint_state").from_bytes, decode_ids, decode_transforms, decode_marker_array],
+    ids=["joint_state", "ids", "transforms", "markers"],
+)
+def test_what_is_read_one_by_one_is_of_bounded_length(decode: Any) -> None:
+    """Ten megabytes of it took up to seven seconds."""
+    head = b"" if decode in (decode_transforms, decode_marker_array) else bytes(12)
+    count = struct.pack("<I", MOST_ITEMS + 1)
+    with pytest.raises(DecodeError, match=f"wanted up to {MOST_ITEMS} items"):
+        decode(b"\0\1\0\0" + head + count + bytes(200 * MOST_ITEMS))
 
 
 def test_strings_must_be_utf8_and_end() -> None:

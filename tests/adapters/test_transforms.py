@@ -138,14 +138,16 @@ def test_what_makes_no_sense_is_left_out_and_counted() -> None:
         transform("map", "map"),
         transform("", "cam"),
         transform("map", ""),
+        transform("map", "x" * 256),
         transform("map", "cam", quaternion=np.zeros(4)),
         transform("map", "cam", quaternion=np.array([0, 0, 0, 2.0])),
         transform("map", "cam", translation=np.array([np.nan, 0, 0])),
         transform("map", "cam", translation=np.array([0, 1e300, 0])),
+        transform("map", "cam", quaternion=np.array([0, 0, 0, 1e300])),
     ]
     assert put(buffer, *bad) == len(bad)
     assert len(buffer) == 0
-    (said,) = buffer.put(encode_transforms(bad[4:5]), is_static=False)
+    (said,) = buffer.put(encode_transforms(bad[5:6]), is_static=False)
     assert said == "'cam' in 'map', which is no rotation: wanted a quaternion of length 1, got 2"
     put(buffer, transform("a", "b"), transform("b", "a"))  # a ring ends
     for target, source in (("map", "a"), ("a", "b"), ("b", "a")):
