@@ -164,6 +164,31 @@ def test_bent_elbows_and_spread_legs_are_found(name: str, angles: tuple[float, .
     np.testing.assert_allclose(place.pose[joints], pose[joints], atol=0.09)
 
 
+@pytest.mark.parametrize(
+    ("name", "scale", "up", "arms"),
+    [
+        ("tshirt-female", 1.055, 1.079, 0.0),
+        ("tshirt-female", 0.95, 1.079, 0.8),
+        ("longsleeve-male", 1.0, -0.06, 0.0),
+        ("tshirt-female", 1.0, -0.12, 0.8),
+    ],
+)
+@pytest.mark.parametrize("is_said", [False, True])
+def test_other_wearers_and_origins(name: str, scale: float, up: float, arms: float, is_said: bool) -> None:
+    """A T-shirt of a taller woman was taken to have hanging arms, that of a shorter one spread legs; a shirt with its
+    origin 6 cm off was worn around the ankles."""
+    garment = load_garment(name)
+    body, pose = load_body(garment.body), standing_pose(arms)
+    transforms = body(torch.as_tensor(pose, dtype=torch.float32)[None]).transforms
+    posed = apply_transforms(garment.v_template[None], blend_transforms(garment.weights, transforms))[0]
+    mesh = SurfaceMesh(scale * (posed.double().numpy() + np.array([0, up, 0])), garment.faces.numpy())
+    place = next(find_places(mesh, body, Placing(pose=pose if is_said else None)))
+    shoulders = float(body.joint_template[[16, 17], 1].mean())
+    assert place.unit == 1
+    assert scale * (shoulders + up) + place.shift[1] == pytest.approx(shoulders, abs=0.02)
+    np.testing.assert_allclose(place.pose, pose, atol=0.12)
+
+
 def test_what_is_said_is_not_overruled() -> None:
     """A tube of which a third faces the other way was refused, although all was said."""
     body, mesh = load_body("neutral"), cone((0.3, -0.6), (0.3, -0.1))
