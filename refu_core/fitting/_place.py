@@ -17,7 +17,7 @@ from refu_core.errors import GarmentError
 from refu_core.fitting._clean import no_opening
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
-from refu_core.fitting._shifts import LIFTS, heights, shifts
+from refu_core.fitting._shifts import HIGHEST, LIFTS, heights, shifts
 from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, lies_over, parts_legs, sample
 from refu_core.fitting._turns import LYING, is_sideways_turn, turns_of
 from refu_core.frames import N_JOINTS
@@ -273,7 +273,7 @@ class _Search:
             if one.pose is here.pose and one.fit.is_near and not one.is_sideways and self.shows_height(one)
             for lift in LIFTS
         ]
-        return [one for one in lifted if not self.too_high(one, bodies[0])]
+        return [one for one in lifted if one.fit.distance < NEAR and not self.too_high(one, bodies[0])]
 
     def shows_height(self, place: Place) -> bool:
         """Whether there is cloth over the shoulders or between the legs, so that it can be worn at one height only."""
@@ -324,6 +324,8 @@ class _Search:
             if start.kind == "floor":  # the floor is where the feet of this pose are
                 moved[1] += float(body.vertices[:, 1].min()) - floor
             lift = start.lift and start.lift + float(shift[1])
+            moved[1] += np.clip(lift, -HIGHEST, HIGHEST) - lift
+            lift = float(np.clip(lift, -HIGHEST, HIGHEST))
             return _at(samples, unit, turn, moved, body, start.kind, lift)
 
         def cost(full: F64) -> float:

@@ -12,6 +12,8 @@ F64 = NDArray[np.float64]
 LIFTS = (-0.06, 0.06, -0.12, 0.12)
 """How far a mesh is lifted when a search for its height begins [m]: between the origins of SMPL and SMPL-X, and between
 the shoulders of people 1.60 and 1.75 m tall, are 12 cm."""
+HIGHEST = 0.15
+"""How far it is lifted at most [m]; what would have to go farther was modelled otherwise, and is searched for."""
 
 
 def shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:

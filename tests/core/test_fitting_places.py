@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -187,6 +188,15 @@ def test_other_wearers_and_origins(name: str, scale: float, up: float, arms: flo
     assert place.unit == 1
     assert scale * (shoulders + up) + place.shift[1] == pytest.approx(shoulders, abs=0.02)
     np.testing.assert_allclose(place.pose, pose, atol=0.12)
+
+
+def test_what_stands_far_off_is_not_lifted() -> None:
+    """Trousers with their origin in their middle were put a third of a metre up from the floor, below the hips."""
+    garment = load_garment("trousers-neutral")
+    v = garment.v_template.double().numpy()
+    middle = (v.min(0) + v.max(0)) / 2
+    places = find_places(SurfaceMesh(v - middle, garment.faces.numpy()), load_body("neutral"), Placing())
+    assert [place.lift for place in itertools.islice(places, 2)] == [0, 0]
 
 
 def test_what_is_said_is_not_overruled() -> None:
