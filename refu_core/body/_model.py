@@ -123,8 +123,11 @@ class BodyArrays:
             if (arrays.faces.min(), arrays.faces.max()) == (1, n):
                 msg += ": they count from 1, wanted from 0; subtract 1"
             raise BodyError(msg)
-        if np.abs(arrays.weights.sum(1) - 1).max() > 1e-3 or arrays.weights.min() < -1e-3:
-            raise BodyError(f"{source}: the skinning weights of a vertex must sum to one, and none be negative")
+        sums, least = arrays.weights.sum(1), arrays.weights.min()
+        if np.abs(sums - 1).max() > 1e-3 or least < -1e-3:
+            msg = f"{source}: the skinning weights of a vertex must sum to one, and none be negative, got sums from "
+            msg += f"{sums.min():.4g} to {sums.max():.4g} and a least weight of {least:.4g}: "
+            raise BodyError(msg + "make negative ones 0, then divide each vertex's weights by their sum")
         return arrays
 
 

@@ -17,7 +17,8 @@ from refu_core.errors import GarmentError
 from refu_core.fitting._clean import no_opening
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
-from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, parts_legs, sample
+from refu_core.fitting._shifts import HIGHEST, LIFTS, heights, shifts
+from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, lies_over, parts_legs, sample
 from refu_core.fitting._turns import LYING, is_sideways_turn, turns_of
 from refu_core.frames import N_JOINTS
 
@@ -106,6 +107,8 @@ class Place:
     """How high the mesh reaches [m]."""
     kind: str
     """How it was placed: as it is (empty), moved from a `floor`, or `searched`."""
+    lift: float = 0.0
+    """How much higher it is than by convention [m]: its wearer, or the origin of their model, was another."""
     notes: list[str] = field(default_factory=list)
     """What was found out, one sentence each."""
 
@@ -122,10 +125,11 @@ class Place:
     def cost(self, extent: float) -> float:
         """The cost as a share of the garment's size; otherwise the smallest size would always be nearest to the skin.
 
-        What nobody does without need counts, too: modelling a garment sideways, with spread legs, hanging or bent arms.
+        What nobody does without need counts, too: modelling a garment sideways, with spread legs, hanging or bent arms,
+        or for a body of another height.
         """
         arms, legs = np.abs(self.pose[[RIGHT_SHOULDER, RIGHT_ELBOW], 1:]).sum(), abs(self.pose[LEFT_HIP, 2])
-        without_need = 0.02 * self.is_sideways + 0.1 * legs + 0.005 * arms
+        without_need = 0.02 * self.is_sideways + 0.1 * legs + 0.005 * arms + _TOLERANCE * (self.lift != 0)
         return float(self.fit.cost / (self.unit * extent) + without_need)
 
     def __call__(self, vertices: F64) -> F64:
@@ -162,6 +166,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     if placing.is_whole and found and found[0].fit.is_near:
         yield _told(found[0])
         return
+    found += search.of_other_heights(found, bodies)
     if placing.pose is None and not any(one.fit.is_plain for one in found):
         found += search.by_convention([PosedBody(body, standing_pose(*angles)) for angles in _RARER], turns)
         near = sorted((one for one in found if one.fit.is_near), key=lambda one: one.cost(extent))
@@ -171,7 +176,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     if good:
         least = min(one.cost(extent) for one in good)
         chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # plain assumptions come first
-        if placing.pose is None:
+        if placing.pose is None or chosen.lift:
             likes = sorted((one for one in found if one.is_like(chosen)), key=lambda one: one.cost(extent))
             refined = [search.refined(one, moves=False, scales=False) for one in likes[:2]]
             if min(one.fit.depth for one in refined) > _TOUCHES:
@@ -254,9 +259,26 @@ class _Search:
         return [
             one
             for here, turn, unit in itertools.product(bodies, turns, self._units)
-            for kind, shift in _shifts(here, is_placed=self._placing.is_placed)
+            for kind, shift in shifts(here, is_placed=self._placing.is_placed)
             if not self.too_high(one := _at(self.samples, unit, turn, shift, here, kind), here)
         ]
+
+    def of_other_heights(self, found: list[Place], bodies: list[PosedBody]) -> list[Place]:
+        """The same higher and lower: the wearer may have been taller or shorter, or the body's origin elsewhere."""
+        if self._placing.is_placed:
+            return []
+        lifted = [
+            _at(self.samples, one.unit, one.turn, one.shift + lift * np.eye(3)[1], here, one.kind, lift)
+            for here, one in itertools.product(bodies, found)
+            if one.pose is here.pose and one.fit.is_near and not one.is_sideways and self.shows_height(one)
+            for lift in LIFTS
+        ]
+        return [one for one in lifted if one.fit.distance < NEAR and not self.too_high(one, bodies[0])]
+
+    def shows_height(self, place: Place) -> bool:
+        """Whether there is cloth over the shoulders or between the legs, so that it can be worn at one height only."""
+        placed = place(self._mesh.vertices), self._mesh.faces, self._body
+        return lies_over(*placed) or parts_legs(*placed)
 
     def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
         """The best place at any height along the body, refined from there; none if there are no heights."""
@@ -267,7 +289,7 @@ class _Search:
         found = [
             one
             for here, turn, unit in itertools.product(bodies[::2], turns, units)
-            for shift in _heights(unit * self._mesh.vertices @ turn.T, here)
+            for shift in heights(unit * self._mesh.vertices @ turn.T, here)
             if not self.too_high(one := _at(few, unit, turn, shift, here, "searched"), here)
         ]
         found.sort(key=lambda one: one.cost(self._extent))
@@ -286,7 +308,8 @@ class _Search:
         angles = np.array([arms[2], max(0.02 * has_legs, start.pose[LEFT_HIP, 2]), elbows, arms[1]])
         x0 = np.concatenate((np.zeros(4), angles))
         turning = np.array([0.1, 0.06 * has_legs, 0.15 * bends, 0.1 * bends]) * (not is_posed)
-        steps = np.array([0.06 * scales, *(0.03 * moves,) * 3, *turning])
+        rises = moves or start.lift != 0
+        steps = np.array([0.06 * scales, 0.03 * moves, 0.03 * rises, 0.03 * moves, *turning])
         free = np.flatnonzero(steps)
         middle = samples.points.mean(0) @ turn.T
         floor = float(body.vertices[:, 1].min())
@@ -300,7 +323,10 @@ class _Search:
             moved = start.shift + shift + (start.unit - unit) * middle  # the middle stays as the size changes
             if start.kind == "floor":  # the floor is where the feet of this pose are
                 moved[1] += float(body.vertices[:, 1].min()) - floor
-            return _at(samples, unit, turn, moved, body, start.kind)
+            lift = start.lift and start.lift + float(shift[1])
+            moved[1] += np.clip(lift, -HIGHEST, HIGHEST) - lift
+            lift = float(np.clip(lift, -HIGHEST, HIGHEST))
+            return _at(samples, unit, turn, moved, body, start.kind, lift)
 
         def cost(full: F64) -> float:
             place = at(full)
@@ -324,30 +350,10 @@ class _Search:
         return at(there(found.x))
 
 
-def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody, kind: str) -> Place:
+def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody, kind: str, lift: float = 0.0) -> Place:
     turned = samples._replace(normals=samples.normals @ turn.T, area=unit**2 * samples.area)
     points = unit * samples.points @ turn.T + shift
-    return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()), kind)
-
-
-def _shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:
-    """Where a mesh may stand by convention: with the body's origin, or on a floor below its feet."""
-    floor = float(body.vertices[:, 1].min())
-    found = [("", np.zeros(3)), ("floor", np.array([0.0, floor, 0.0]))]
-    return found[:1] if is_placed else found
-
-
-def _heights(vertices: F64, body: PosedBody) -> list[F64]:
-    """Shifts that put a mesh (V, 3) [m] round the body's middle, at all heights."""
-    skin = body.vertices.double().numpy()
-    low, high = vertices.min(0), vertices.max(0)
-    middle = (low + high) / 2
-    found = []
-    for height in np.arange(skin[:, 1].min() - low[1], skin[:, 1].max() - high[1] + 0.02, 0.08):
-        near = np.abs(skin[:, 1] - (middle[1] + height)) < max(0.05, (high[1] - low[1]) / 4)
-        front, back = (skin[near, 2].max(), skin[near, 2].min()) if near.any() else (0.0, 0.0)
-        found.append(np.array([-middle[0], height, (front + back) / 2 - middle[2]]))
-    return found
+    return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()), kind, lift)
 
 
 def _told(place: Place) -> Place:
@@ -367,6 +373,8 @@ def _told(place: Place) -> Place:
         notes.append(f"{up} is up and {about}{'+' if front[axis] > 0 else '-'}{'xyz'[axis]} is in front")
     if place.kind == "floor":
         notes.append("it stood with the floor at 0 and was moved to the body's feet")
+        if place.lift:
+            notes[-1] += f", and {1e3 * abs(place.lift):.0f} mm {'up' if place.lift > 0 else 'down'} from there"
     elif np.abs(place.shift).max() > 1e-3:
         notes.append("moved by ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * place.shift)))
     forward, arms, elbows, legs = np.degrees(

@@ -32,9 +32,10 @@ _RING_FACES = 0.99
 _N_SKIN = 600
 """About how many vertices of the skin are checked for being within cloth."""
 _DOWN = np.array([0.3, 0.6, 0.9])
-"""Where thighs and shins are checked for cloth between them, as shares of the way from one joint to the next."""
+"""Where thighs and shins are checked for cloth between them, and shoulders for cloth above them, as shares of the way
+from one joint to the next."""
 _ACROSS = 0.5
-"""Least cosine between the normal of cloth that lies along the skin and the way off the skin."""
+"""Least cosine between the normal of cloth that lies along the skin and the way off the skin, or across some way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,16 +172,31 @@ def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
         np.concatenate([joints[a] + _DOWN[:, None] * (joints[b] - joints[a]) for a, b in pairwise(leg)])
         for leg in ([1, 4, 7], [2, 5, 8])
     )
+    return _crosses(vertices, faces, left, right - left)
+
+
+def lies_over(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
+    """Whether cloth of vertices (V, 3) [m] lies over the shoulders of a body, at any height: a skirt doesn't."""
+    neck, *shoulders = body.joint_template[[12, 16, 17]].double().numpy()
+    over = np.concatenate([neck + _DOWN[:, None] * (shoulder - neck) for shoulder in shoulders])
+    low, high = vertices[:, 1].min() - 1, vertices[:, 1].max() + 1
+    over[:, 1] = low
+    return _crosses(vertices, faces, over, np.tile([0.0, high - low, 0.0], (len(over), 1)))
+
+
+def _crosses(vertices: F64, faces: NDArray[np.int64], starts: F64, ways: F64) -> bool:
+    """Whether cloth lies across a line that begins at one of the starts (N, 3) and goes its way (N, 3)."""
     corner, u, v = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     u, v = u - corner, v - corner
     normal = np.cross(u, v)
-    for start, way in zip(left, right - left, strict=True):
-        # Möller and Trumbore 1997: where the way from leg to leg meets each triangle's plane, and if inside it.
+    for start, way in zip(starts, ways, strict=True):
+        # Möller and Trumbore 1997: where the way meets each triangle's plane, and if inside it.
         steep = -(normal @ way)
         steep = np.where(np.abs(steep) < 1e-15, np.inf, steep)
         off = start - corner
         along = np.cross(off, way)
         t, a, b = (off * normal).sum(1) / steep, (v * along).sum(1) / steep, -(u * along).sum(1) / steep
-        if ((a >= 0) & (b >= 0) & (a + b <= 1) & (t >= 0) & (t <= 1)).any():
+        is_across = np.abs(normal @ way) > _ACROSS * np.linalg.norm(normal, axis=1) * np.linalg.norm(way)
+        if (is_across & (a >= 0) & (b >= 0) & (a + b <= 1) & (t >= 0) & (t <= 1)).any():
             return True
     return False

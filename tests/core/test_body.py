@@ -212,7 +212,7 @@ def save(path: Path, **changes: object) -> Path:
         ({"v_template": np.array(["a"] * 60)}, "not an array of numbers"),
         ({"v_template": np.array([{}])}, "can't be read as .npz"),
         ({"f": np.full((9, 3), 60)}, "faces must index 60 vertices"),
-        ({"weights": np.ones((60, 24))}, "must sum to one"),
+        ({"weights": np.ones((60, 24))}, "must sum to one.* got sums from 24 to 24 .*divide each vertex's weights"),
         ({"weights": np.ones((60, 55))}, r"weights must have the shape \(60, 24\)"),
         ({"shapedirs": np.zeros((60, 3, 9))}, "shapedirs must be"),
         ({"posedirs": np.ones((60, 3, 486))}, r"posedirs must have the shape \(60, 3, 207\)"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -162,6 +163,40 @@ def test_bent_elbows_and_spread_legs_are_found(name: str, angles: tuple[float, .
     assert place.unit == 1
     joints = [17, 19] if "sleeve" in name else [1]
     np.testing.assert_allclose(place.pose[joints], pose[joints], atol=0.09)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "up", "arms"),
+    [
+        ("tshirt-female", 1.055, 1.079, 0.0),
+        ("tshirt-female", 0.95, 1.079, 0.8),
+        ("longsleeve-male", 1.0, -0.06, 0.0),
+        ("tshirt-female", 1.0, -0.12, 0.8),
+    ],
+)
+@pytest.mark.parametrize("is_said", [False, True])
+def test_other_wearers_and_origins(name: str, scale: float, up: float, arms: float, is_said: bool) -> None:
+    """A T-shirt of a taller woman was taken to have hanging arms, that of a shorter one spread legs; a shirt with its
+    origin 6 cm off was worn around the ankles."""
+    garment = load_garment(name)
+    body, pose = load_body(garment.body), standing_pose(arms)
+    transforms = body(torch.as_tensor(pose, dtype=torch.float32)[None]).transforms
+    posed = apply_transforms(garment.v_template[None], blend_transforms(garment.weights, transforms))[0]
+    mesh = SurfaceMesh(scale * (posed.double().numpy() + np.array([0, up, 0])), garment.faces.numpy())
+    place = next(find_places(mesh, body, Placing(pose=pose if is_said else None)))
+    shoulders = float(body.joint_template[[16, 17], 1].mean())
+    assert place.unit == 1
+    assert scale * (shoulders + up) + place.shift[1] == pytest.approx(shoulders, abs=0.02)
+    np.testing.assert_allclose(place.pose, pose, atol=0.12)
+
+
+def test_what_stands_far_off_is_not_lifted() -> None:
+    """Trousers with their origin in their middle were put a third of a metre up from the floor, below the hips."""
+    garment = load_garment("trousers-neutral")
+    v = garment.v_template.double().numpy()
+    middle = (v.min(0) + v.max(0)) / 2
+    places = find_places(SurfaceMesh(v - middle, garment.faces.numpy()), load_body("neutral"), Placing())
+    assert [place.lift for place in itertools.islice(places, 2)] == [0, 0]
 
 
 def test_what_is_said_is_not_overruled() -> None:
