@@ -17,6 +17,8 @@ from refu_core.garments import UvMap
 
 MESH_SUFFIXES: tuple[str, ...] = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 """Files that are read."""
+_PACKED = (b"KHR_draco_mesh_compression", b"EXT_meshopt_compression")
+"""Extensions of glTF whose meshes aren't read."""
 _MAX_FILE_BYTES = 256 << 20
 _MAX_FACES = 400_000
 """A larger mesh is refused before anything is computed: no garment that is worn in real time is as fine."""
@@ -73,6 +75,8 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
     try:
         if suffix == ".gltf" and b'"uri"' in content and b'"data:' not in content:
             raise ValueError("its numbers are in a file beside it; save it as one file, .glb")
+        if suffix.startswith(".gl") and b'"extensionsRequired"' in content and any(one in content for one in _PACKED):
+            raise ValueError("it is compressed (Draco or meshopt), which isn't read: export it without compression")
         with np.errstate(all="ignore"):  # numbers that aren't finite are refused below
             mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
         _require_few(len(mesh.faces))

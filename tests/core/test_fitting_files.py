@@ -72,6 +72,16 @@ def test_a_gltf_whose_numbers_are_elsewhere_is_said(tmp_path: Path) -> None:
         read_surface(tmp_path / "model.gltf")
 
 
+def test_a_compressed_glb_is_said(tmp_path: Path) -> None:
+    """It was said to be 0 large."""
+    text = b'{"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]}'
+    text += b" " * (-len(text) % 4)
+    content = np.array([0x46546C67, 2, 20 + len(text), len(text), 0x4E4F534A], "<u4").tobytes() + text
+    (tmp_path / "model.glb").write_bytes(content)
+    with pytest.raises(GarmentError, match=r"compressed .* export it without"):
+        read_surface(tmp_path / "model.glb")
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_quads_are_halved_as_any_polygon_is(seed: int) -> None:
     """Convex or not, flat or not: those that are cut at once are cut where their ears would be."""
