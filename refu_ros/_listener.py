@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -141,33 +140,8 @@ class Listener:
         self._node.get_logger().info(f"listening to {full_name} ({self.stream.message_type})")
         # Overrides are parameters, which are never removed: only topics that don't come and go have them.
         overrides = None if self._settings.follow_humans else QoSOverridingOptions.with_default_policies()
-        take = self.in_turn(full_name, partial(self._on_input, person, full_name))
+        take = partial(self._on_input, person, full_name)
         self._hear(person, self.stream.message_type, topic, take, ros_qos(INPUT_QOS), qos_overriding_options=overrides)
-
-    def in_turn(self, topic: str, take: Callable[[bytes], object]) -> Callable[[bytes], None]:
-        """A callback that records messages as they come, and has the executor `take` the newest, one a turn.
-
-        The executor keeps an event for each message that has come. If `take` were called at once and couldn't keep up,
-        timers and requests would wait behind ever more of them.
-        """
-        node, waiting = self._node, deque[bytes](maxlen=INPUT_QOS.depth)
-        guarded = node.guarded(topic, take)
-
-        def come(data: bytes) -> None:
-            node.statistics.receive()
-            node.recording.put(topic, self.stream.message_type, data, INPUT_QOS)
-            if len(waiting) == waiting.maxlen:
-                node.statistics.drop("stale")
-            elif not waiting:
-                node.executor.create_task(turn)
-            waiting.append(data)
-
-        def turn() -> None:
-            guarded(waiting.popleft())
-            if waiting:
-                node.executor.create_task(turn)
-
-        return come
 
     def _hear(
         self, name: str, kind: str, topic: str, take: Callable[[bytes], object], qos: QoSProfile, **options: Any
@@ -179,6 +153,8 @@ class Listener:
         node = self._node
         if self.scene is None:
             return
+        node.statistics.receive()
+        node.recording.put(topic, self.stream.message_type, data, INPUT_QOS)
         if not node.is_watched():
             node.statistics.count("skip.unwatched")
             return

@@ -21,9 +21,7 @@ from msg_adapters.scene import Scene
 from refu_core import load_body
 from refu_core.keypoints import MOST_PEOPLE, Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
-from refu_ros._listener import INPUT_QOS
 from refu_ros._node import GarmentNode
-from refu_ros._program import make_executor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -78,22 +76,6 @@ def test_who_has_left_a_tracker_is_forgotten(node: Any, monkeypatch: pytest.Monk
     assert len(listener._frames) == MOST_PEOPLE
     assert listener._frames[f"p{MOST_PEOPLE + 9}"] == "camera"  # who came first is forgotten
     assert "p9" not in listener._frames
-
-
-def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any) -> None:
-    """Timers and requests waited behind all messages that had come: twenty seconds, and ever longer."""
-    executor, done = make_executor(), list[bytes | str]()
-    executor.add_node(node)
-    come = node._listener.in_turn("/smpl_params", done.append)
-    for i in range(100):
-        come(bytes([i]))
-    executor.create_task(lambda: done.append("other"))
-    while len(done) < INPUT_QOS.depth + 1:
-        executor.spin_once(timeout_sec=0.1)
-    executor.remove_node(node)
-    assert done == [b"\x5f", "other", *(bytes([i]) for i in range(96, 100))]
-    report = node.statistics.report()
-    assert (report.total["received"], report.total["drop.stale"]) == (100, 100 - INPUT_QOS.depth)
 
 
 def test_a_crowd_of_bodies_and_a_long_name_take_nothing_from_others(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
