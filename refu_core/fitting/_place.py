@@ -324,9 +324,9 @@ class _Search:
             if start.kind == "floor":  # the floor is where the feet of this pose are
                 moved[1] += float(body.vertices[:, 1].min()) - floor
             lift = start.lift and start.lift + float(shift[1])
-            moved[1] += np.clip(lift, -HIGHEST, HIGHEST) - lift
-            lift = float(np.clip(lift, -HIGHEST, HIGHEST))
-            return _at(samples, unit, turn, moved, body, start.kind, lift)
+            held = float(np.clip(lift, -HIGHEST, HIGHEST))
+            moved[1] += held - lift
+            return _at(samples, unit, turn, moved, body, start.kind, held)
 
         def cost(full: F64) -> float:
             place = at(full)
