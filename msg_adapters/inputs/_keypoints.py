@@ -117,4 +117,4 @@ def _name(namespace: str, number: int) -> str:
         word = f"{word}_{zlib.crc32(namespace.encode()):08x}"
     if word and not word[0].isalpha():
         word = f"person_{word}"
-    return f"{word or 'person'}_{number}" if number else word
+    return f"{word or 'person'}_{number % (1 << 32)}" if number else word  # a topic's name has no minus

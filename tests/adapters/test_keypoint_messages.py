@@ -144,14 +144,16 @@ def test_what_is_refused(kind: str, data: bytes, said: str) -> None:
 
 
 @settings(max_examples=15)
-@given(st.text(max_size=80))
-def test_names_do_for_topics(namespace: str) -> None:
-    try:
-        data = marker_array(marker(7, ns=namespace.replace("\0", ""), points=np.ones((K, 3))))
-    except UnicodeEncodeError:
-        return
-    (name,) = decode_keypoints("keypoint_markers", data, K)
-    assert name == "" or (name.isidentifier() and name.isascii() and name[0] != "_")
+@given(st.text(max_size=80), st.integers(-(2**31), 2**31 - 2))
+def test_names_do_for_topics(namespace: str, number: int) -> None:
+    people = [marker(7, number + i, ns=namespace.replace("\0", ""), points=np.ones((K, 3))) for i in range(2)]
+    for count in (1, 2):
+        try:
+            names = [*decode_keypoints("keypoint_markers", marker_array(*people[:count]), K)]
+        except UnicodeEncodeError:
+            return
+        assert len(names) == count
+        assert all(name == "" or (name.isidentifier() and name.isascii() and name[0] != "_") for name in names)
 
 
 def standing(layout: str, place: float = 0.0) -> Any:
