@@ -34,6 +34,7 @@ from asset_tools.surfaces import (
 from numpy.typing import NDArray
 
 from refu_core.body import JOINT_NAMES, PARENTS
+from refu_core.mesh import face_normals
 from refu_lab._ray_kernels import light_kernel
 
 PEOPLE = 600
@@ -171,12 +172,11 @@ def close_cavities(mesh: BaseMesh, reference: Vertices) -> tuple[scipy.sparse.cs
 
 def _openness(v: Vertices, f: Faces) -> NDArray[np.float64]:
     """How much of the half space above each face is free within 25 cm, from 0 (enclosed) to 1; shape (F,)."""
-    corners = v[f]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = face_normals(v, f)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     mesh = wp.Mesh(wp.array(v, dtype=wp.vec3), wp.array(f.ravel(), dtype=wp.int32))
     sun, sky = wp.zeros(len(f), dtype=float), wp.zeros(len(f), dtype=float)
-    points = [wp.array(corners.mean(1), dtype=wp.vec3), wp.array(normals, dtype=wp.vec3)]
+    points = [wp.array(v[f].mean(1), dtype=wp.vec3), wp.array(normals, dtype=wp.vec3)]
     rays = [wp.vec3(0.0, 1.0, 0.0), 0.0, 0, 400, 0.25]
     wp.launch(light_kernel, dim=len(f), inputs=[mesh.id, *points, *rays], outputs=[sun, sky])
     return np.asarray(sky.numpy(), dtype=np.float64)

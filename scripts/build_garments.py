@@ -11,34 +11,27 @@ describes the files.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 import torch
 import trimesh
 from asset_tools.cuts import Cut, Neckline, Plane, clip
 from asset_tools.makehuman import BaseMesh
 from asset_tools.remesh import remesh
 from asset_tools.shape_space import N_BETAS, ShapeSpace, build_shape_spaces
-from asset_tools.surfaces import (
-    Faces,
-    Vertices,
-    attach,
-    boundary_loops,
-    compact,
-    directed_edges,
-    smoothing_matrix,
-)
+from asset_tools.surfaces import Faces, Vertices, attach, boundary_loops, compact, directed_edges, smoothing_matrix
 from build_bodies import PEOPLE
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody, load_body
+from refu_core.fitting._clean import components
+from refu_core.fitting._fit import _larger
 from refu_core.garments import GarmentCard, Tailoring, card_to_json
+from refu_core.mesh import face_normals
 from refu_core.sdf import ExactSdf
 
 Field = Callable[[Vertices], NDArray[np.float64]]
@@ -248,19 +241,13 @@ def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -
     used, source_faces = compact(mesh.triangles(garment.source))
     source = space.mean[used]
     fine = trimesh.Trimesh(source, source_faces, process=False).subdivide_loop(1)
-    v, f = np.asarray(fine.vertices), np.asarray(fine.faces, dtype=np.int64)
-    for cut in garment.cuts:
-        v, f = clip(v, f, cut)
-    f = _largest_part(f)
-    kept, f = compact(f)
-    v = v[kept]
-
-    length = _edge_for(v, f, garment.vertices)
+    v, f = cut_out(np.asarray(fine.vertices), np.asarray(fine.faces, dtype=np.int64), garment.cuts)
+    length = edge_for(v, f, garment.vertices)
     v, f = remesh(v, f, sizing=lambda p: np.full(len(p), length))
     from_source = attach(v, source, source_faces)
     draped = drape(v, f, garment, body)
     # Draping has stretched the mesh: remesh it, for even edges and the right count.
-    length *= np.sqrt(_area(draped, f) / _area(v, f))
+    length *= np.sqrt(area(draped, f) / area(v, f))
     for _ in range(4):
         final, faces = remesh(draped, f, sizing=lambda p: np.full(len(p), length))  # noqa: B023
         if abs(len(final) - garment.vertices) < 0.01 * garment.vertices:
@@ -352,11 +339,6 @@ def shortfall_from(
     return shortfall
 
 
-def _larger(a: Vertices, b: Vertices) -> Vertices:
-    """Row by row the longer of two vectors."""
-    return np.where((np.linalg.norm(a, axis=1) >= np.linalg.norm(b, axis=1))[:, None], a, b)
-
-
 def _edges_on_cuts(v: Vertices, f: Faces, cuts: tuple[Cut, ...]) -> list[tuple[NDArray[np.int64], Cut]]:
     """The boundary loops with the cut that made each."""
     return [
@@ -364,21 +346,23 @@ def _edges_on_cuts(v: Vertices, f: Faces, cuts: tuple[Cut, ...]) -> list[tuple[N
     ]
 
 
-def _largest_part(f: Faces) -> Faces:
-    n = int(f.max()) + 1
-    links = scipy.sparse.coo_matrix((np.ones(f.size), (f.ravel(), np.roll(f, 1, 1).ravel())), shape=(n, n))
-    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
+def cut_out(v: Vertices, f: Faces, cuts: Sequence[Cut]) -> tuple[Vertices, Faces]:
+    """The largest connected part of a mesh within all cuts."""
+    for cut in cuts:
+        v, f = clip(v, f, cut)
+    _, label = components(f, len(v))
     of_face = label[f[:, 0]]
-    return f[of_face == np.bincount(of_face).argmax()]
+    kept, f = compact(f[of_face == np.bincount(of_face).argmax()])
+    return v[kept], f
 
 
-def _area(v: Vertices, f: Faces) -> float:
-    return float(np.linalg.norm(np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]), axis=1).sum() / 2)
+def area(v: Vertices, f: Faces) -> float:
+    return float(np.linalg.norm(face_normals(v, f), axis=1).sum() / 2)
 
 
-def _edge_for(v: Vertices, f: Faces, vertices: int) -> float:
+def edge_for(v: Vertices, f: Faces, vertices: int) -> float:
     """Edge length of equilateral triangles that cover the mesh with `vertices` vertices [m]."""
-    return float(np.sqrt(_area(v, f) / (2 * vertices) * 4 / np.sqrt(3)))
+    return float(np.sqrt(area(v, f) / (2 * vertices) * 4 / np.sqrt(3)))
 
 
 def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:

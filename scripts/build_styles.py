@@ -23,12 +23,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from build_garments import ramp
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody, load_body
 from refu_core.frames import N_BETAS
 from refu_core.garments import BUILTIN_GARMENTS, N_STYLES, GarmentTemplate, load_garment
-from refu_core.mesh import vertex_areas
+from refu_core.mesh import vertex_areas, vertex_normals
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothTopology
 from refu_core.simulation._drape import Draper
@@ -38,12 +39,6 @@ _CLEARANCE = 0.005
 """Distance that a cut made longer or wider keeps from the mean body [m]."""
 _DRAPES = 24
 """Number of drapes of drawn parameters, besides the mean cut's and two for each parameter."""
-
-
-def _smoothstep(value: F64, low: float, high: float) -> F64:
-    t = np.clip((value - low) / (high - low), 0, 1)
-    smooth: F64 = t * t * (3 - 2 * t)
-    return smooth
 
 
 class _Cut:
@@ -59,30 +54,20 @@ class _Cut:
         self.bottom = loops[int(np.argmin(height))]
         self.from_top = self.topology.distance_from(self.x, self.top)
         self.held = garment.card.held_at_waist
+        self._laplacian = garment.mesh.uniform_laplacian()
         self._sdf = ExactSdf(body.faces)
         self._sdf.update(body.rest_vertices(torch.zeros(1, N_BETAS))[0])
 
     def normals(self) -> F64:
         """Outward unit normals, smoothed so that a wider cut doesn't deepen the folds of the body under it."""
-        a, b, c = (self.x[self.topology.mesh.faces[:, k]] for k in range(3))
-        face = np.cross(b - a, c - a)
-        normal = np.zeros_like(self.x)
-        for k in range(3):
-            np.add.at(normal, self.topology.mesh.faces[:, k], face)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        normal = self.smooth(normal, 30)
+        normal = self.smooth(vertex_normals(self.x, self.topology.mesh.faces), 30)
         unit: F64 = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         return unit
 
     def smooth(self, field: F64, rounds: int = 10) -> F64:
         """A field (N, 3) after `rounds` of moving each vertex halfway to the mean of its neighbours."""
-        i, j = self.topology.mesh.edges.T
-        degree = np.bincount(self.topology.mesh.edges.ravel(), minlength=len(field))[:, None]
         for _ in range(rounds):
-            total = np.zeros_like(field)
-            np.add.at(total, i, field[j])
-            np.add.at(total, j, field[i])
-            field = 0.5 * field + 0.5 * total / degree
+            field = field - 0.5 * (self._laplacian @ field)
         return field
 
     def outside(self, vertices: F64) -> F64:
@@ -113,10 +98,10 @@ def _sleeve_length(cut: _Cut) -> F64:
 
 def _ease(cut: _Cut) -> F64:
     if cut.held:
-        return cut.normals() * _smoothstep(cut.from_top, 0.01, 0.08)[:, None]
+        return cut.normals() * ramp(cut.from_top, 0.01, 0.08)[:, None]
     # Sleeves are narrower than the trunk: the same share of their girth is less.
-    weight = _smoothstep(cut.from_top, 0.06, 0.22)
-    return cut.normals() * (weight * (1 - 0.4 * _smoothstep(np.abs(cut.x[:, 0]), 0.17, 0.26)))[:, None]
+    weight = ramp(cut.from_top, 0.06, 0.22)
+    return cut.normals() * (weight * (1 - 0.4 * ramp(np.abs(cut.x[:, 0]), 0.17, 0.26)))[:, None]
 
 
 def _neckline(cut: _Cut) -> F64:
@@ -136,7 +121,7 @@ def _neckline(cut: _Cut) -> F64:
     away = cut.smooth(away / (np.linalg.norm(away, axis=1, keepdims=True) + 1e-12), 20)
     # A neckline is cut deeper in front than at the back and on the shoulders.
     middle = x[cut.top, 2].mean()
-    front = 0.35 + 0.65 * _smoothstep(x[:, 2], middle - 0.01, middle + 0.07)
+    front = 0.35 + 0.65 * ramp(x[:, 2], middle - 0.01, middle + 0.07)
     field: F64 = away * (np.exp(-((d / 0.1) ** 2)) * front)[:, None]
     return field
 

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from asset_tools.cuts import Cut, Neckline, Plane, clip
+from asset_tools.cuts import Cut, Neckline, Plane
 from asset_tools.remesh import remesh
-from asset_tools.surfaces import Faces, Vertices, boundary_loops, compact, self_intersections
-from build_garments import Field, _area, _edge_for, _largest_part, drape, keep_clear, ramp
+from asset_tools.surfaces import Faces, Vertices, boundary_loops, self_intersections
+from build_garments import Field, area, cut_out, drape, edge_for, keep_clear, ramp
 
 from refu_core.body import BUILTIN_BODIES, SmplBody, load_body
 from refu_core.fitting import GarmentDetails, Placing, PosedBody, SurfaceMesh, Transfer, fit_garment
@@ -203,17 +203,14 @@ def build(pattern: Pattern, body: SmplBody) -> tuple[Vertices, Faces]:
     cuts = pattern.cuts
     if pattern.skirt is not None:  # the cloth leaves the skin above the legs, and goes on from there
         cuts = (Plane(1, pattern.skirt[0], 1), *cuts[1:])
-    for cut in cuts:
-        v, f = clip(v, f, cut)
-    kept, f = compact(_largest_part(f))
-    v = v[kept]
+    v, f = cut_out(v, f, cuts)
     if pattern.skirt is not None:
         v, f = continued(v, f, *pattern.skirt)
-    length = _edge_for(v, f, pattern.vertices)
+    length = edge_for(v, f, pattern.vertices)
     v, f = remesh(v, f, sizing=lambda p: np.full(len(p), length))
     draped = drape(v, f, pattern, body)  # type: ignore[arg-type]
     # Draping has stretched the mesh: remesh it, for even edges and the right count.
-    length *= np.sqrt(_area(draped, f) / _area(v, f))
+    length *= np.sqrt(area(draped, f) / area(v, f))
     final, faces = remesh(draped, f, sizing=lambda p: np.full(len(p), length))
     transfer = Transfer.of(final, faces, PosedBody(body, np.zeros((N_JOINTS, 3))))
     shaped = (body.rest_vertices(torch.eye(N_BETAS)) - body.v_template).permute(1, 2, 0)

@@ -9,6 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from asset_tools.surfaces import Faces, Vertices, boundary_loops
+from refu_core.mesh import face_normals, vertex_normals
 
 Sizing = Callable[[Vertices], NDArray[np.float64]]
 """Wanted edge length [m] at points (N, 3): shape (N,)."""
@@ -195,13 +196,11 @@ class _Mesh:
     def relax(self, surface: trimesh.Trimesh, curves: list[Vertices]) -> None:
         """Moves vertices within the surface to the centres of their faces, boundary ones along the boundary."""
         v, f, used = self._local()
-        area = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-        normals = np.stack([np.bincount(f.ravel(), np.repeat(area[:, k], 3), len(v)) for k in range(3)], 1)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        normals = vertex_normals(v, f)
         centres = v[f].mean(1)
         size = np.array([self.size[i] for i in used])
         # Relative to the wanted area, so that the sizing field isn't blurred.
-        weight = np.linalg.norm(area, axis=1) / size[f].mean(1) ** 2
+        weight = np.linalg.norm(face_normals(v, f), axis=1) / size[f].mean(1) ** 2
         total = np.bincount(f.ravel(), np.repeat(weight, 3), len(v))
         moved = np.stack([np.bincount(f.ravel(), np.repeat(weight * centres[:, k], 3), len(v)) for k in range(3)], 1)
         step = moved / np.maximum(total, 1e-30)[:, None] - v

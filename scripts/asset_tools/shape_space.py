@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asset_tools.makehuman import BODY_VERTICES, MIRROR, BaseMesh
-from asset_tools.surfaces import vertex_areas
 from refu_core.body import JOINT_NAMES, PARENTS
+from refu_core.frames import N_BETAS
+from refu_core.mesh import vertex_areas
 
-N_BETAS = 10
 PELVIS = np.array([0.0, -0.22, 0.02])
 """Where every T-posed body's pelvis lies [m]."""
 

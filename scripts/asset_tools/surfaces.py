@@ -7,16 +7,11 @@ import scipy.sparse
 import trimesh
 from numpy.typing import NDArray
 
+from refu_core.mesh import Connectivity
 from refu_core.metrics import SheetChecker
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
-
-
-def vertex_areas(v: Vertices, f: Faces) -> NDArray[np.float64]:
-    """A third of the area of a vertex's faces [m²], shape (V,)."""
-    area = np.linalg.norm(np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]), axis=1) / 2
-    return np.bincount(f.ravel(), np.repeat(area / 3, 3), len(v))
 
 
 def directed_edges(f: Faces) -> NDArray[np.int64]:
@@ -47,13 +42,11 @@ def compact(f: Faces) -> tuple[NDArray[np.int64], Faces]:
 
 def smoothing_matrix(f: Faces, n: int) -> scipy.sparse.csr_matrix:
     """The matrix that takes the mean of the neighbours; on a boundary, of the two neighbours along it. Shape (n, n)."""
-    edges = {(int(a), int(b)) for a, b in directed_edges(f)}
-    border = {(a, b) for a, b in edges if (b, a) not in edges}
-    on_border = {a for a, _ in border}
-    both = {(a, b) for a, b in edges if a not in on_border} | {(b, a) for a, b in edges if b not in on_border}
-    both |= border | {(b, a) for a, b in border}
-    pairs = np.array(sorted(both))
-    matrix = scipy.sparse.csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    mesh = Connectivity.of(f, n)
+    border, edges = mesh.boundary, np.concatenate((mesh.edges, mesh.edges[:, ::-1]))
+    inner = edges[~np.isin(edges[:, 0], border)]
+    rows, columns = np.concatenate((inner, border, border[:, ::-1])).T
+    matrix = scipy.sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     return scipy.sparse.csr_matrix(scipy.sparse.diags(1 / np.asarray(matrix.sum(1)).ravel()) @ matrix)
 
 
