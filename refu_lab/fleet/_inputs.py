@@ -30,7 +30,8 @@ class Input:
     source: str
     """A path or a URL."""
     name: str
-    """Unique name of its results: a relative path with slashes, without a suffix unless names would be equal."""
+    """Unique name of its results: a relative path with slashes, without a suffix unless names would be equal, or one
+    the folder of another: reports are folders."""
 
 
 def is_plain(inputs: Sequence[str]) -> bool:
@@ -133,7 +134,7 @@ def _named(sources: Iterable[str]) -> Iterator[Input]:
         for source, path in paths.items()
     }
     bare = {s: r.with_suffix("") if r.suffix in SUFFIXES else r for s, r in short.items()}
-    count = Counter(bare.values())
+    count = Counter(place for name in bare.values() for place in (name, *name.parents))
     for source in sources:
         name = bare[source] if count[bare[source]] == 1 else short[source]
         yield Input(source, name.as_posix())

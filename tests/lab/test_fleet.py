@@ -132,6 +132,7 @@ def test_no_two_recordings_have_one_name(tmp_path_factory: pytest.TempPathFactor
     found = find_recordings([str(folder / path) for path in sorted(paths)])
     assert len({recording.name for recording in found}) == len(paths)
     assert not any(recording.name.startswith(("/", "..")) for recording in found)
+    assert not any(one.name.startswith(f"{other.name}/") for one in found for other in found)  # its report is a folder
 
 
 # ---- what is done ----------------------------------------------------------------------------------------------------
