@@ -39,7 +39,8 @@ def _command(options: EvaluateOptions, table: str) -> str:
     parts = [f"refu evaluate --table {table}", f"--motions motions/{every}" if table == "motion" else f"--data {data}"]
     parts += [f"--body {Path(options.body).name}"] if options.body is not None else []
     parts += [] if options.collider else ["--no-collider"]
-    return " ".join([*parts, *(f"--weights {path.resolve().name}" for path in options.weights)])
+    parts += [" ".join(("--weights", *(path.resolve().name for path in options.weights)))] if options.weights else []
+    return " ".join(parts)
 
 
 def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None = None) -> list[ResultTable]:

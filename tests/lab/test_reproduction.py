@@ -27,7 +27,9 @@ from refu_core.garments import PAPER_GARMENTS, GarmentTemplate, SkinBelow, load_
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import Wearable
 from refu_core.refu import SCALE_PRESETS, Refu
-from refu_lab.reproduction import _build, _methods, _motion, _plots, _runs, _sdf, _tables
+from refu_lab.cli import _parser
+from refu_lab.commands.evaluate import EvaluateOptions
+from refu_lab.reproduction import _build, _evaluate, _methods, _motion, _plots, _runs, _sdf, _tables
 from refu_lab.tables import RESULT_TABLES
 
 GARMENT = "short-pant-male"
@@ -70,6 +72,16 @@ def test_every_figure_of_the_paper_stands_beside_a_method_of_ours() -> None:
         assert method in built[table], (table, method)
         assert metric in _tables.METRICS
     assert set(_build.SAMPLE_TABLES) | {"time", "sdf", "postures", "motion"} == set(RESULT_TABLES)
+
+
+def test_commands_that_pages_name_can_be_given() -> None:
+    weights = (Path("mine"), Path("yours"))
+    command = _evaluate._command(EvaluateOptions(data=(Path("a/set"),), weights=weights, collider=False), "parts")
+    given = _parser().parse_args(command.split()[1:])
+    assert (given.table, given.collider, tuple(given.weights)) == ("parts", False, weights)
+    for method in _methods.METHODS.values():
+        if command := method.train_command(GARMENT):
+            assert f"{_parser().parse_args(command.split()[1:]).output}/".startswith(f"weights/{GARMENT}/")
 
 
 # ---- emulated networks -----------------------------------------------------------------------------------------------
