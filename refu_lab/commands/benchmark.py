@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,14 +127,15 @@ class BenchmarkOptions:
     @property
     def command(self) -> str:
         """The command that measures the same again, with folder names in place of full paths."""
-        parts = ["refu benchmark"]
-        parts += [f"--garments {','.join(self.garments)}"] if self.garments is not None else []
-        parts += [f"--motions {self.motions.resolve().name}/"] if self.motions is not None else []
-        parts += [f"--weights {self.weights.resolve().name}/"] if self.weights is not None else []
-        parts += [f"--body {Path(self.body).name}"] if self.body is not None else []
+        parts = ["refu", "benchmark"]
+        parts += ["--garments", ",".join(self.garments)] if self.garments is not None else []
+        parts += ["--motions", f"{self.motions.resolve().name}/"] if self.motions is not None else []
+        parts += ["--weights", f"{self.weights.resolve().name}/"] if self.weights is not None else []
+        parts += ["--body", Path(self.body).name] if self.body is not None else []
+        parts += ["--device", self.device] if self.device is not None else []
         parts += [] if self.collider else ["--no-collider"]
-        parts += ["--quick"] if self.quick else [f"--rounds {self.rounds}"]
-        return " ".join(parts)
+        parts += ["--quick"] if self.quick else ["--rounds", str(self.rounds)]
+        return shlex.join(parts)
 
 
 def add(commands: Any) -> None:

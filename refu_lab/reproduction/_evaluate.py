@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -34,13 +35,14 @@ _TIMED = 40
 
 def _command(options: EvaluateOptions, table: str) -> str:
     """The command that makes a table again, with folder names in place of full paths."""
-    every = f" --motion-every {options.motion_every}" if options.motion_every > 1 else ""
-    data = " ".join("/".join(path.resolve().parts[-2:]) for path in options.data)
-    parts = [f"refu evaluate --table {table}", f"--motions motions/{every}" if table == "motion" else f"--data {data}"]
-    parts += [f"--body {Path(options.body).name}"] if options.body is not None else []
+    every = ["--motion-every", str(options.motion_every)] if options.motion_every > 1 else []
+    data = ["/".join(path.resolve().parts[-2:]) for path in options.data]
+    parts = ["refu", "evaluate", "--table", table]
+    parts += ["--motions", "motions/", *every] if table == "motion" else ["--data", *data]
+    parts += ["--body", Path(options.body).name] if options.body is not None else []
     parts += [] if options.collider else ["--no-collider"]
-    parts += [" ".join(("--weights", *(path.resolve().name for path in options.weights)))] if options.weights else []
-    return " ".join(parts)
+    parts += ["--weights", *(path.resolve().name for path in options.weights)] if options.weights else []
+    return shlex.join(parts)
 
 
 def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None = None) -> list[ResultTable]:

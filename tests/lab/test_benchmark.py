@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, Timing, m
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
 from refu_lab.benchmark._sdfs import PLAIN_QUERY, read_stretches, sdf_frame, sdf_methods
 from refu_lab.benchmark._sections import GRAPH, LAUNCHES, Section, frame_runners
-from refu_lab.cli import main
+from refu_lab.cli import _parser, main
 from refu_lab.commands.benchmark import BenchmarkOptions
 from refu_lab.reproduction import published_modes
 
@@ -87,6 +88,8 @@ def test_page_data_and_plot_say_the_same(tiny: Round) -> None:
     assert json.loads((tiny.folder / "performance.json").read_text()) == tiny.result
     page = (tiny.folder / "performance.md").read_text()
     assert f"`{tiny.result['command']}`" in page
+    given = _parser().parse_args(shlex.split(tiny.result["command"])[1:])
+    assert (given.device, given.weights, given.quick) == ("cpu", Path("no weights"), True)
     for row in tiny.of("sdf"):
         assert row["method"] in page
     widths = {line.count("|") for line in page.split("## ")[1].splitlines() if line.startswith("|")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,9 +76,9 @@ def test_every_figure_of_the_paper_stands_beside_a_method_of_ours() -> None:
 
 
 def test_commands_that_pages_name_can_be_given() -> None:
-    weights = (Path("mine"), Path("yours"))
+    weights = (Path("mine"), Path("yours, too"))
     command = _evaluate._command(EvaluateOptions(data=(Path("a/set"),), weights=weights, collider=False), "parts")
-    given = _parser().parse_args(command.split()[1:])
+    given = _parser().parse_args(shlex.split(command)[1:])
     assert (given.table, given.collider, tuple(given.weights)) == ("parts", False, weights)
     for method in _methods.METHODS.values():
         if command := method.train_command(GARMENT):
