@@ -17,6 +17,7 @@ from refu_core import GarmentPipeline, RefuError, __version__
 from refu_core._cache import code_hash
 from refu_core._engine import Engine, Lost
 from refu_core.errors import printable
+from refu_core.garments import garment_files
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet._engine import run_function
 from refu_lab.fleet._inputs import Input
@@ -202,9 +203,12 @@ def _key(options: FleetOptions, recording: Input, path: Path) -> str:
 
 
 def _content(options: ReplayOptions) -> str:
-    """The options that results depend on, as text."""
+    """The options that results depend on, as text; what a garment's name and a folder of weights stand for, too."""
     names = [option.name for option in fields(options) if option.name not in _NOT_CONTENT]
-    return json.dumps({name: _told(getattr(options, name)) for name in names})
+    known = garment_files()
+    files = [known[name] for name in options.garments if name in known]
+    files += [Path(options.weights)] if options.weights else []
+    return json.dumps({name: _told(getattr(options, name)) for name in names} | {"files": _told(files)})
 
 
 def _told(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -22,10 +23,11 @@ from msg_adapters import BagReader
 from refu_core import RefuError, SmplFrame
 from refu_core._engine import InProcess, Lost
 from refu_lab.cli import main
+from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import find_recordings, fleet_table, is_plain, open_engine
 from refu_lab.fleet._engine import DaskEngine, FleetError, run_function
 from refu_lab.fleet._summary import FleetResult
-from refu_lab.fleet.replay import _CODE
+from refu_lab.fleet.replay import _CODE, _content
 from tests.lab import fleet_tasks
 from tests.lab.test_replay import motion, write_bag
 
@@ -250,6 +252,17 @@ def messages(path: Path) -> list[tuple[str, int, bytes]]:
         every = [(one.topic, one.log_time_ns, bytes(one.data)) for one in bag.messages()]
     assert {topic for topic, *_ in every} > {"/garments", "/body"}
     return [one for one in every if one[0] != "/diagnostics"]
+
+
+def test_results_depend_on_garments_and_weights_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REFU_GARMENTS", str(tmp_path))
+    options = ReplayOptions(input=Path(), garments=("kilt",), weights=str(tmp_path / "weights"))
+    (tmp_path / "weights" / "kilt").mkdir(parents=True)
+    seen = []
+    for file, content in itertools.product(("weights/kilt/tailornet-hybrid.safetensors", "kilt.npz"), (b"1", b"2")):
+        (tmp_path / file).write_bytes(content)
+        seen.append(_content(options))
+    assert len(set(seen)) == 4
 
 
 def test_finished_results_stay_so_when_modules_are_compiled() -> None:
