@@ -63,6 +63,8 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
     name = target.stem.removeprefix("garment_")
     if name in BUILTIN_GARMENTS:
         raise GarmentError(f"{name} is a garment that ships: call this one otherwise (--name)")
+    if name in ("body", "skin"):  # exported files and the viewer would take it for the wearer
+        raise GarmentError(f"{name} is what the wearer's is called: call the garment otherwise (--name)")
     require_name(name if options.name is None else options.name)
     if options.name not in (None, name):
         raise GarmentError(f"{target}: a garment is called as its file: leave --name out, or write {options.name}.npz")

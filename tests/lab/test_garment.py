@@ -134,6 +134,7 @@ def test_what_cuts_the_body_and_what_is_torn_is_warned_of(pairs: int, long: floa
     ("arguments", "wanted"),
     [
         (["--name", "tshirt-male"], "is a garment that ships"),
+        (["--name", "body"], "is what the wearer's is called"),
         (["--unit", "furlong"], "no unit 'furlong': wanted m, dm"),
         (["--unit", "mm"], "wanted a garment of"),
         (["--pose", "sitting"], "no pose 'sitting': wanted t, the angle"),
