@@ -25,18 +25,17 @@ _LAST_STAMP_NS = 2**31 * 10**9 - 1
 """The latest stamp that a message can hold."""
 
 
-def garment_encoder(pipeline: GarmentPipeline, options: ReplayOptions) -> adapters.MarkerArrayEncoder:
-    """The encoder of the pipeline's garments, in their order, each in its own colour."""
-    meshes = [
+def garment_meshes(pipeline: GarmentPipeline, person: str = "") -> list[adapters.MarkerMesh]:
+    """The pipeline's garments as markers, in their order, each in its own colour."""
+    return [
         adapters.MarkerMesh(
-            ns=adapters.garment_namespace(name),
+            ns=adapters.garment_namespace(name, person),
             faces=garment.faces.cpu().numpy(),
             n_vertices=garment.n_vertices,
             color=(*garment.card.color, 1.0),
         )
         for name, garment in pipeline.garments.items()
     ]
-    return adapters.MarkerArrayEncoder(meshes, frame_id=options.frame_id, axes=options.axes)
 
 
 @contextmanager

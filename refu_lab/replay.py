@@ -27,7 +27,7 @@ from refu_core.modes import BackboneName
 from refu_core.realtime import PipelineOutput
 from refu_lab.commands._common import require_apart
 from refu_lab.commands.replay import ReplayOptions
-from refu_lab.dressed_bag import DressedBag, garment_encoder
+from refu_lab.dressed_bag import DressedBag, garment_meshes
 from refu_lab.sources import body_facts, open_source
 from refu_lab.truth import GroundTruth
 
@@ -89,6 +89,8 @@ class ReplayResult:
     options: ReplayOptions
     source: str
     """What was read: a topic and its type, or a motion file."""
+    pipeline: GarmentPipeline
+    """What dressed the frames."""
     frames: list[FrameResult] = field(default_factory=list)
     """The frames that were evaluated."""
     latencies_ms: array[float] = field(default_factory=lambda: array("d"))
@@ -105,8 +107,6 @@ class ReplayResult:
     on_skin: dict[str, Figures] = field(default_factory=dict)
     """As `after`, but measured against the skin instead of the collider."""
     interrupted: bool = False
-    body: dict[str, Any] = field(default_factory=dict)
-    """The body that wore the garments, and how well the built-in mesh fits it (`body_facts`)."""
 
     def add(
         self, frame: SmplFrame, output: PipelineOutput, latency_ms: float, garments: Mapping[str, GarmentRecord] | None
@@ -158,7 +158,7 @@ class ReplayResult:
             "warnings": self.warnings,
             "interrupted": self.interrupted,
             "collider": self.options.collider,
-            "body": self.body,
+            "body": body_facts(self.pipeline),
             "skin_shift_mm": self.skin_shift_mm(),
             "latency_ms": self.latency_ms(),
             "garments": garments,
@@ -169,11 +169,10 @@ class Evaluator:
     """Exact metrics of every frame, before and after collision handling, against the collider and against the skin."""
 
     def __init__(self, pipeline: GarmentPipeline, truth: GroundTruth) -> None:
-        self._checker, self._skin = (CollisionChecker(pipeline.body.faces.cpu().numpy()) for _ in range(2))
-        self._faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
+        self._checker, self._skin = (CollisionChecker(pipeline.body.faces) for _ in range(2))
         self._truth = truth
         self._before, self._after, self._on_skin = (
-            {name: GarmentMetrics(faces) for name, faces in self._faces.items()} for _ in range(3)
+            {name: GarmentMetrics(garment.faces) for name, garment in pipeline.garments.items()} for _ in range(3)
         )
 
     def add(self, frame: SmplFrame, output: PipelineOutput, latency_ms: float) -> dict[str, GarmentRecord]:
@@ -183,12 +182,11 @@ class Evaluator:
         own_ms = {name: output.stats.garments[name].ms for name in output}
         records = {}
         for name, mesh in output.items():
-            raw = self._checker.check(mesh.raw, self._faces[name])
-            done = self._checker.check(mesh.local, self._faces[name])
+            raw, done = (self._checker.check(vertices, mesh.faces) for vertices in (mesh.raw, mesh.local))
             truth = self._truth.of(name, frame)
             self._before[name].add(mesh.raw, raw, truth=truth)
             self._after[name].add(mesh.local, done, truth=truth)
-            self._on_skin[name].add(mesh.local, self._skin.check(mesh.local, self._faces[name]))
+            self._on_skin[name].add(mesh.local, self._skin.check(mesh.local, mesh.faces))
             records[name] = GarmentRecord(
                 latency_ms=latency_ms - sum(own_ms.values()) + own_ms[name],
                 before=Findings(raw.n_inside, raw.n_pairs, raw.max_depth),
@@ -230,7 +228,7 @@ def replay(
         pipeline = load()
         # Compiles the kernels, so that the first frame isn't late; in a pose nobody sends, so none counts as known.
         pipeline(SmplFrame(pose=np.full((24, 3), 1e-3, np.float32)))
-        result = ReplayResult(options, source.description, body=body_facts(pipeline))
+        result = ReplayResult(options, source.description, pipeline)
         if options.backbone == BackboneName.AUTO:
             result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]
         source.history = PoseHistory() if pipeline.heeds_past else None
@@ -239,7 +237,7 @@ def replay(
             faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
             truth = GroundTruth.of_bag(options.input, faces, axes=options.axes)
         evaluator = Evaluator(pipeline, truth) if options.evaluate else None
-        encoder = garment_encoder(pipeline, options)
+        encoder = adapters.MarkerArrayEncoder(garment_meshes(pipeline), frame_id=options.frame_id, axes=options.axes)
         bag = None if options.output is None else stack.enter_context(DressedBag(options, pipeline, source))
         records = itertools.islice(source.records, options.max_frames)
         total = source.count if options.max_frames is None else min(source.count or sys.maxsize, options.max_frames)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from refu_core import GarmentPipeline, RefuError
+from refu_core import RefuError
 from refu_core._files import replacing
 from refu_core.metrics import CollisionChecker
 from refu_core.recordings import upright_turn
@@ -53,9 +53,8 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        pipeline = result.options.load_pipeline()
-        _plot(result, pipeline, folder)
-        frames, turned = _draw_frames(result, pipeline, folder, progress=progress)
+        _plot(result, folder)
+        frames, turned = _draw_frames(result, folder, progress=progress)
         page = folder / "index.html"
         with replacing(page) as file:
             file.write(_page(result, frames, turned).encode())
@@ -64,7 +63,7 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
     return page
 
 
-def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None:
+def _plot(result: ReplayResult, folder: Path) -> None:
     start = result.frames[0].frame.stamp_ns
     times = np.array([1e-9 * (f.frame.stamp_ns - start) for f in result.frames])
     drawn, axes = new_axes(3, size=(10.8, 7.5), sharex=True)
@@ -72,7 +71,7 @@ def _plot(result: ReplayResult, pipeline: GarmentPipeline, folder: Path) -> None
     inside, pairs, depth = axes
     for name in result.after:
         records = [f.garments[name] for f in result.frames]
-        colour = pipeline.garments[name].card.color
+        colour = result.pipeline.garments[name].card.color
         for when, alpha, width in (("before", 0.45, 1.2), ("after", 1.0, 1.8)):
             found = np.array([getattr(record, when) for record in records]) * (1, 1, 1e3)
             for ax, values in zip((inside, pairs, depth), found.T, strict=True):
@@ -104,10 +103,9 @@ def _legend(axes: Axes, *, columns: int) -> None:
     )
 
 
-def _draw_frames(
-    result: ReplayResult, pipeline: GarmentPipeline, folder: Path, *, progress: bool
-) -> tuple[list[Frame], str]:
+def _draw_frames(result: ReplayResult, folder: Path, *, progress: bool) -> tuple[list[Frame], str]:
     """Renders the worst, a median and the best frame, before and after; returns the frames and their HTML turntable."""
+    pipeline = result.pipeline
     order = sorted(range(len(result.frames)), key=lambda i: result.frames[i].badness)
     chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
     body_faces = pipeline.body.faces.cpu().numpy()

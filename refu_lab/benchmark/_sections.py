@@ -18,6 +18,7 @@ from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow, Timing, m
 from refu_lab.benchmark._paper import PaperSettings, PaperStructure
 from refu_lab.benchmark._sdfs import PLAIN_QUERY, EncodedFrame, Window, plain_query, sdf_methods
 from refu_lab.commands.benchmark import BenchmarkOptions
+from refu_lab.dressed_bag import garment_meshes
 
 Pipelines = Mapping[tuple[str, str], GarmentPipeline]
 """By backbone and mode. The default backbone comes first, or the other one if that has no weights."""
@@ -69,8 +70,7 @@ class Section:
 
     def load_pipeline(self, mode: str, backbone: str, *, graph: bool = True) -> GarmentPipeline:
         """Another pipeline of this garment."""
-        how: dict[str, Any] = {"mode": mode, "backbone": backbone, "device": self.device, "graph": graph}
-        return self.options.load_pipeline(self.garment, **how)
+        return self.options.load_pipeline(self.garment, mode=mode, backbone=backbone, device=self.device, graph=graph)
 
 
 class FrameRunner:
@@ -79,16 +79,8 @@ class FrameRunner:
     def __init__(self, pipeline: GarmentPipeline, *, persons: int = 1) -> None:
         self._pipeline, self._persons = pipeline, range(persons)
         self._decode = adapters.decoder_for("multiarray").from_bytes
-        meshes = [
-            adapters.MarkerMesh(
-                ns=adapters.garment_namespace(name, f"p{person}" if persons > 1 else ""),
-                faces=garment.faces.cpu().numpy(),
-                n_vertices=garment.n_vertices,
-            )
-            for person in self._persons
-            for name, garment in pipeline.garments.items()
-        ]
-        self._encoder = adapters.MarkerArrayEncoder(meshes)
+        names = [f"p{person}" if persons > 1 else "" for person in self._persons]
+        self._encoder = adapters.MarkerArrayEncoder([mesh for name in names for mesh in garment_meshes(pipeline, name)])
         self.stages: list[dict[str, float]] = []
         """Time of each stage in each frame that wasn't a jump, by whichever clock `time.perf_counter` reads [ms]."""
 
