@@ -16,18 +16,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters.cdr import Buffer, CdrReader
+from msg_adapters.cdr import Buffer
 from msg_adapters.errors import DecodeError, decoding
+from msg_adapters.inputs._pose_array import MESSAGE_TYPE, read_poses
 from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
-KEYPOINT_TYPES: dict[str, str] = {"keypoint_poses": "geometry_msgs/msg/PoseArray", "keypoint_markers": MARKER_ARRAY}
+KEYPOINT_TYPES: dict[str, str] = {"keypoint_poses": MESSAGE_TYPE, "keypoint_markers": MARKER_ARRAY}
 """Message type of each input type that holds keypoints."""
 
 _CUBE, _SPHERE, _ADD = 1, 2, 0
 _LISTS = (6, 7, 8)  # CUBE_LIST, SPHERE_LIST, POINTS
 _PERSON = 100
 """How many marker ids each person has."""
-_POSE_NUMBERS = 7
 _LONGEST_NAME = 60
 
 
@@ -57,14 +57,10 @@ def decode_keypoints(input_type: str, data: Buffer, n: int) -> dict[str, Keypoin
 
 
 def _of_poses(data: Buffer, n: int) -> dict[str, Keypoints]:
-    reader = CdrReader(data)
-    stamp_ns, frame_id = reader.fields("Ts")
-    count = reader.length(item_bytes=_POSE_NUMBERS * 8)
-    poses = reader.array("f8", count * _POSE_NUMBERS).reshape(count, _POSE_NUMBERS)
-    reader.finish()
-    if not count:
+    stamp_ns, frame_id, poses = read_poses(data)
+    if not len(poses):
         return {}
-    _check_count(count, n, "poses")
+    _check_count(len(poses), n, "poses")
     return {"": _keypoints(poses[:, :3], np.ones(n), stamp_ns, frame_id)}
 
 

@@ -22,18 +22,23 @@ _POSE_NUMBERS = 7  # position xyz, orientation xyzw
 _MIN_NORM = 1e-6
 
 
+def read_poses(data: Buffer) -> tuple[int, str, NDArray[Any]]:
+    """Stamp [ns], frame_id and poses, (K, 7), of a message in CDR."""
+    reader = CdrReader(data)
+    stamp_ns, frame_id = reader.fields("Ts")
+    poses = reader.array("f8", reader.length(item_bytes=_POSE_NUMBERS * 8) * _POSE_NUMBERS)
+    reader.finish()
+    return stamp_ns, frame_id, poses.reshape(-1, _POSE_NUMBERS)
+
+
 def from_bytes(data: Buffer) -> SmplFrame:
     """The frame of a message in CDR; quaternions are normalised."""
     with decoding(MESSAGE_TYPE):
-        reader = CdrReader(data)
-        stamp_ns, _ = reader.fields("Ts")
-        count = reader.length(item_bytes=_POSE_NUMBERS * 8)
-        if count != N_JOINTS:
+        stamp_ns, _, poses = read_poses(data)
+        if len(poses) != N_JOINTS:
             hint = "points of a tracker are the input type keypoint_poses"
-            raise DecodeError(f"wanted {N_JOINTS} poses, one for each joint of SMPL, got {count}; {hint}")
-        poses = reader.array("f8", N_JOINTS * _POSE_NUMBERS).reshape(N_JOINTS, _POSE_NUMBERS).astype(np.float64)
-        reader.finish()
-        quaternions = poses[:, 3:]
+            raise DecodeError(f"wanted {N_JOINTS} poses, one for each joint of SMPL, got {len(poses)}; {hint}")
+        quaternions = poses[:, 3:].astype(np.float64)
         largest = np.abs(quaternions).max(axis=1)
         for joint in np.flatnonzero(~((largest >= _MIN_NORM) & np.isfinite(largest))):
             got = f"the orientation of {JOINT_NAMES[joint]} isn't a rotation: {quaternions[joint].tolist()}"
