@@ -24,8 +24,7 @@ class PostProcess:
 
     def __init__(self, faces: Tensor | NDArray[np.int64], n_vertices: int) -> None:
         """For garments with these `faces`, shape (G, 3); raises `MeshError` for a face of a vertex that isn't there."""
-        mesh = Connectivity.of(faces.cpu() if isinstance(faces, Tensor) else faces, n_vertices)
-        self._laplacian = mesh.uniform_laplacian()  # x_i minus the mean of its neighbours, (N, N)
+        self._laplacian = Connectivity.of(faces, n_vertices).uniform_laplacian()  # x minus its neighbours' mean, (N, N)
 
     @torch.no_grad()
     def optimise(

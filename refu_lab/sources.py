@@ -160,14 +160,13 @@ def _frame_of_first(bag: adapters.SmplBag) -> tuple[str, bool]:
 def _motion_records(motion: adapters.Motion) -> Iterator[FrameRecord]:
     encode = adapters.encoder_for("multiarray")
     for i in range(len(motion)):
-        found: dict[str, Any] = {"frame": None, "error": None, "raw": b""}
+        frame, error, stamp_ns = None, None, round(1e9 * i / motion.fps)
         try:
-            found["frame"] = motion.frame(i)
-            found["raw"] = encode(found["frame"])
+            frame = motion.frame(i)
         except FrameError as cause:  # one bad frame of a clip is skipped like one bad message of a bag
-            found["error"] = adapters.DecodeError(str(cause))
-        stamp_ns = round(1e9 * i / motion.fps)
-        yield adapters.FrameRecord(stamp_ns=stamp_ns, log_time_ns=stamp_ns, topic=INPUT_TOPIC, **found)
+            error = adapters.DecodeError(str(cause))
+        raw = b"" if frame is None else encode(frame)
+        yield FrameRecord(frame, error, stamp_ns, stamp_ns, INPUT_TOPIC, raw)
 
 
 _Up = Callable[[bytes], "NDArray[np.float64] | None"]

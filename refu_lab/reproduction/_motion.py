@@ -72,7 +72,7 @@ def motion_table(clips: Mapping[str, Motion], *, library: Library, every: int, p
     shapes = drawn_shapes(n_pairs)
     bar = tqdm(total=len(OUTFITS) * n_pairs, desc="motion", unit="frame", disable=None if progress else True)
     found: dict[str, dict[tuple[str, str], list[Judged]]] = {}
-    shifts: dict[str, dict[str, SkinShifts]] = {}
+    shifts: dict[tuple[str, str], SkinShifts] = {}
     for garments in OUTFITS:
         pipelines: dict[str, GarmentPipeline] = {}
         for method in MOTION_METHODS:
@@ -85,19 +85,17 @@ def motion_table(clips: Mapping[str, Motion], *, library: Library, every: int, p
         if not pipelines:
             continue
         worn = OutfitJudge(garments, pipelines)
-        of_body = shifts.setdefault(worn.body.name, {})
-        is_first = not of_body
+        whole = worn.body.name, "all clips"
+        is_first = whole not in shifts
         persons = iter(shapes)
         for name, clip in clips.items():
-            shift = SkinShifts()
             for index in indices[name]:
                 judged, way = worn.judge(frame_pair(clip, index, next(persons)))
                 for (garment, method), one in judged.items():
                     found.setdefault(garment, {}).setdefault((name, method), []).append(one)
-                shift.add(way)
+                for key in (whole, (worn.body.name, name)) if is_first else ():
+                    shifts.setdefault(key, SkinShifts()).add(way)
                 bar.update()
-            if is_first:
-                of_body[name] = shift
     bar.close()
     for garment, by_clip in found.items():
         for method in MOTION_METHODS:
@@ -105,9 +103,8 @@ def motion_table(clips: Mapping[str, Motion], *, library: Library, every: int, p
             table.add(f"{garment}, all clips", method, figures_of(everything) if everything else {})
         for (name, method), ones in by_clip.items():
             table.add(f"{garment}, {name}", method, figures_of(ones))
-    for body, of_clips in shifts.items():
-        for name, moved in {"all clips": sum(of_clips.values(), SkinShifts()), **of_clips}.items():
-            table.add(f"{body} body, {name}", _SKIN, moved.figures())
+    for (body, name), moved in shifts.items():
+        table.add(f"{body} body, {name}", _SKIN, moved.figures())
     return table
 
 
@@ -125,19 +122,9 @@ class SkinShifts:
         self._largest = max(self._largest, float(way.max()))
         self._moved += int((way > _MOVED).sum())
 
-    def __add__(self, other: SkinShifts) -> SkinShifts:
-        """The shifts of the frames of both."""
-        whole = SkinShifts()
-        whole._count = self._count + other._count
-        whole._sum, whole._moved = self._sum + other._sum, self._moved + other._moved
-        whole._largest = max(self._largest, other._largest)
-        return whole
-
     def figures(self) -> dict[str, float | None]:
         """The mean, 99th percentile (to 0.01 mm) and largest shift, and the share of vertices that moved."""
         n = int(self._count.sum())
-        if not n:
-            return {}
         return {
             "shift_mean_mm": 1e3 * self._sum / n,
             "shift_p99_mm": 1e3 * int(np.searchsorted(self._count.cumsum(), 0.99 * n)) * _BIN,

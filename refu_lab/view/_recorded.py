@@ -221,11 +221,8 @@ def has_meshes(path: Path) -> bool:
 
 def _front(path: Path) -> float:
     """Where the person faces at first [rad], by the bag's SMPL parameters (taken in SMPL's axes); else along x."""
-    try:
-        frame = next((record.frame for record in adapters.iter_smpl_frames(path) if record.frame is not None), None)
-    except RefuError:
-        return 0.0
-    if frame is None:
-        return 0.0
-    forward = adapters.vertices_ros_from_smpl(Rotation.from_rotvec(frame.pose[0]).apply([0.0, 0.0, 1.0]))
-    return float(np.arctan2(forward[1], forward[0]))
+    with suppress(RefuError, StopIteration):
+        frame = next(record.frame for record in adapters.iter_smpl_frames(path) if record.frame is not None)
+        forward = adapters.vertices_ros_from_smpl(Rotation.from_rotvec(frame.pose[0]).apply([0.0, 0.0, 1.0]))
+        return float(np.arctan2(forward[1], forward[0]))
+    return 0.0

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     import viser
 
 DEFAULT_PORT = 8080
-_PORTS = 20
-"""Number of ports that are tried, from the default one on."""
 
 
 @one_thread()
@@ -96,17 +94,15 @@ def open_film(options: ViewOptions, *, progress: bool = False) -> DressedFilm | 
 
 
 def _serve(options: ViewOptions) -> viser.ViserServer:
-    """A server at the requested port, or at a free one."""
+    """A server at the requested port, or at the first free one."""
     import viser
 
-    port = options.port
-    if port is None:
-        port = next((p for p in range(DEFAULT_PORT, DEFAULT_PORT + _PORTS) if _is_free(options.host, p)), DEFAULT_PORT)
-    if not _is_free(options.host, port):
-        msg = f"{options.host}:{port} can't be listened on: it is taken, or no address of this machine (--port, --host)"
-        raise RefuError(msg)
+    # viser itself would take the next free port, and wait forever where there is none.
+    if not _is_free(options.host, options.port or 0):
+        where = options.host if options.port is None else f"{options.host}:{options.port}"
+        raise RefuError(f"{where} can't be listened on: it is taken, or no address of this machine (--port, --host)")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner
-        return viser.ViserServer(host=options.host, port=port, verbose=False)
+        return viser.ViserServer(host=options.host, port=options.port or DEFAULT_PORT, verbose=False)
 
 
 def _stop(server: viser.ViserServer) -> None:
