@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core import GarmentError, GarmentPipeline, SmplFrame, load_body, load_garment
+from refu_core import GarmentError, GarmentPipeline, PipelineOutput, SmplFrame, load_body, load_garment
 from refu_core.fitting import (
     UNITS,
     FittedGarment,
@@ -138,6 +138,12 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
     return standing_pose(np.radians(angle))
 
 
+def dressed(pipeline: GarmentPipeline, output: PipelineOutput) -> list[RenderMesh]:
+    """The body and what it wears, without the translation."""
+    worn = [RenderMesh(mesh.local, mesh.faces, pipeline.garments[name].card.color) for name, mesh in output.items()]
+    return [RenderMesh(output.body, pipeline.body.faces.numpy()), *worn]
+
+
 def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
     """For each of a few poses, worn by skinning: the collisions left with the body, and how far it is stretched."""
     pipeline = GarmentPipeline.load([made.template], backbone="skinned")
@@ -168,13 +174,11 @@ def warnings_of(worn: dict[str, dict[str, Any]]) -> list[str]:
 def picture(garments: Sequence[str], *, size: tuple[int, int] = (260, 400), samples: int = 4) -> NDArray[np.uint8]:
     """Garments worn together, a view of `size` (width, height) for each pose: sRGB, shape (height, poses width, 3)."""
     pipeline = GarmentPipeline.load(garments)
-    faces = pipeline.body.faces.numpy()
     views = []
     for yaw, pose in zip((25.0, 40.0, -160.0), try_on_poses().values(), strict=True):
         output = pipeline(SmplFrame(pose=pose))
-        worn = [RenderMesh(mesh.local, mesh.faces, pipeline.garments[name].card.color) for name, mesh in output.items()]
         camera = Viewpoint.framing(output.body, size=size, yaw=yaw)
-        views.append(render([RenderMesh(output.body, faces), *worn], camera=camera, size=size, samples=samples))
+        views.append(render(dressed(pipeline, output), camera=camera, size=size, samples=samples))
     return np.concatenate(views, axis=1)
 
 

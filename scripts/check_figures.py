@@ -40,12 +40,8 @@ def figures_of(bag: Path) -> Figures:
     """What a replay measures in a bag, before and after collisions are removed."""
     found: Figures = {}
     for backbone, sdf in MODES:
-        how: dict[str, Any] = {
-            "garments": tuple(garments_of(bag)) or DEFAULT_GARMENTS,
-            "backbone": backbone,
-            "sdf": sdf,
-        }
-        options = ReplayOptions(input=bag, max_frames=FRAMES, **how)
+        garments = tuple(garments_of(bag)) or DEFAULT_GARMENTS
+        options = ReplayOptions(input=bag, max_frames=FRAMES, garments=garments, backbone=backbone, sdf=sdf)
         result = replay(options, pipeline=pipeline_for(options))
         for garment in options.garments:
             methods = {backbone: result.before[garment], f"node, {backbone}, {sdf}": result.after[garment]}

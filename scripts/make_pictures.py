@@ -21,13 +21,13 @@ from PIL import Image
 from tqdm import tqdm
 
 import msg_adapters as adapters
-from refu_core import GarmentPipeline, PipelineOutput, SmplFrame, load_body, load_garment
+from refu_core import GarmentPipeline, SmplFrame, load_body, load_garment
 from refu_core.body import joints_of
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.recordings import interpolated
 from refu_core.simulation import POSTURES, SELF_TOUCHING, GarmentDataset, posture
 from refu_lab.contact_sheet import contact_sheet
-from refu_lab.garment import picture
+from refu_lab.garment import dressed, picture
 from refu_lab.render import SKIN, Backdrop, RenderMesh, Viewpoint, render
 
 if TYPE_CHECKING:
@@ -35,12 +35,6 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
-
-
-def dressed(pipeline: GarmentPipeline, output: PipelineOutput) -> list[RenderMesh]:
-    """The body and what it wears, without the translation."""
-    worn = [RenderMesh(mesh.local, mesh.faces, pipeline.garments[name].card.color) for name, mesh in output.items()]
-    return [RenderMesh(output.body, pipeline.body.faces.numpy()), *worn]
 
 
 def save_jpeg(image: NDArray[np.uint8], name: str) -> None:
@@ -137,16 +131,13 @@ _MOST = 0.02  # [m]
 
 
 def collider_sheet(
-    garments: Sequence[str] = DEFAULT_GARMENTS,
-    poses: Sequence[str] = SELF_TOUCHING,
-    size: tuple[int, int] = (230, 270),
-    samples: int = 9,
+    poses: Sequence[str] = SELF_TOUCHING, size: tuple[int, int] = (230, 270), samples: int = 9
 ) -> NDArray[np.uint8]:
-    """One column per pose: the skin, the collider with what was moved in red, and the garments on it.
+    """One column per pose: the skin, the collider with what was moved in red, and T-shirt and shorts on it.
 
     Returns sRGB, shape (3 height, columns width, 3), of pictures of `size` (width, height).
     """
-    pipeline = GarmentPipeline.load(garments)
+    pipeline = GarmentPipeline.load(DEFAULT_GARMENTS)
     faces = pipeline.body.faces.numpy()
     lower = joints_of("left_shin", "right_shin")
     is_framed = ~torch.isin(pipeline.body.weights.argmax(1), torch.tensor(lower)).numpy()
