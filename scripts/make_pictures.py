@@ -131,13 +131,16 @@ _MOST = 0.02  # [m]
 
 
 def collider_sheet(
-    poses: Sequence[str] = SELF_TOUCHING, size: tuple[int, int] = (230, 270), samples: int = 9
+    garments: Sequence[str] = DEFAULT_GARMENTS,
+    poses: Sequence[str] = SELF_TOUCHING,
+    size: tuple[int, int] = (230, 270),
+    samples: int = 9,
 ) -> NDArray[np.uint8]:
-    """One column per pose: the skin, the collider with what was moved in red, and T-shirt and shorts on it.
+    """One column per pose: the skin, the collider with what was moved in red, and the garments on it.
 
     Returns sRGB, shape (3 height, columns width, 3), of pictures of `size` (width, height).
     """
-    pipeline = GarmentPipeline.load(DEFAULT_GARMENTS)
+    pipeline = GarmentPipeline.load(garments)
     faces = pipeline.body.faces.numpy()
     lower = joints_of("left_shin", "right_shin")
     is_framed = ~torch.isin(pipeline.body.weights.argmax(1), torch.tensor(lower)).numpy()

@@ -221,5 +221,6 @@ def load_pipelines(
         with suppress(WeightsError):
             pipelines[backbone, mode] = options.load_pipeline(garment, mode=mode, backbone=backbone, device=device)
             continue
-        missing[f"{garment}: {backbone}, {mode}"] = f"refu train {garment} --backbone {backbone} --mode {mode}"
+        command = f"refu train {garment} --data DIR --backbone {backbone} --mode {mode}"
+        missing[f"{garment}: {backbone}, {mode}"] = command
     return pipelines, missing
