@@ -14,6 +14,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any
 
+from refu_core._collector import paused
 from refu_core._versions import VERSION
 from refu_core.errors import BodyError, FrameError, GarmentError, MeshError, RefuError, WeightsError
 from refu_core.frames import SmplFrame
@@ -79,10 +80,11 @@ def _packages() -> set[str]:
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
-    if name in _packages():
-        return import_module(f"{__name__}.{name}")
+    with paused():
+        if name in _LAZY:
+            return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+        if name in _packages():
+            return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -17,6 +17,7 @@ from types import FrameType
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; more threads would wait for busy cores
 
 from refu_core import RefuError, __version__
+from refu_core._collector import collect_rarely
 from refu_core.errors import printable
 from refu_lab.commands import COMMANDS
 from refu_lab.commands._common import (
@@ -51,6 +52,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
+    collect_rarely()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal or file that has no → gets a ?
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it can't write to

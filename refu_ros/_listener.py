@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -63,6 +64,10 @@ class Listener:
         """Whether people are shown as if their frame were that of the messages: there is no tf2_msgs."""
         self._retry = node.create_timer(_RETRY_S, node.guarded("transforms", self._place), clock=clock)
         self._retry.cancel()
+        self._turns: dict[str, deque[bytes]] = {}
+        """The newest messages of each input that waits; whose turn it is comes first."""
+        self._next_turn = node.create_timer(0.0, node.guarded("inputs", self._take_turn), clock=clock)
+        self._next_turn.cancel()
         self._camera: adapters.Camera | None = None
 
     @property
@@ -131,6 +136,7 @@ class Listener:
             self._node.destroy_subscription(subscription)
             self.doubts.forget(name)
         self._inputs.clear()
+        self._turns.clear()
         self._frames.clear()
         self.since = self._tracked = self._tf_asked_at = self._camera = None
         self._waiting, self.is_untransformed = adapters.MessageFilter(self._node.statistics, most=self.room), False
@@ -140,7 +146,7 @@ class Listener:
         self._node.get_logger().info(f"listening to {full_name} ({self.stream.message_type})")
         # Overrides are parameters, which are never removed: only topics that don't come and go have them.
         overrides = None if self._settings.follow_humans else QoSOverridingOptions.with_default_policies()
-        take = partial(self._on_input, person, full_name)
+        take = partial(self._come, person, full_name)
         self._hear(person, self.stream.message_type, topic, take, ros_qos(INPUT_QOS), qos_overriding_options=overrides)
 
     def _hear(
@@ -149,12 +155,40 @@ class Listener:
         """Subscribes; names that aren't a person's begin with a slash. Raises `RefuError`."""
         self._inputs[name] = self._node.create_subscription(interface(kind), topic, take, qos, raw=True, **options)
 
-    def _on_input(self, person: str, topic: str, data: bytes) -> None:
+    def _come(self, person: str, topic: str, data: bytes) -> None:
+        """Records a message and lets it wait for its turn.
+
+        The executor does one after another all that is ready. If each message were worked on as it comes, timers and
+        requests would wait behind those of everybody: for seconds, where a crowd's come faster than they are followed.
+        """
         node = self._node
         if self.scene is None:
             return
         node.statistics.receive()
         node.recording.put(topic, self.stream.message_type, data, INPUT_QOS)
+        waiting = self._turns.setdefault(person, deque(maxlen=INPUT_QOS.depth))
+        if len(waiting) == waiting.maxlen:
+            node.statistics.drop("stale")
+        waiting.append(data)
+        if self._next_turn.is_canceled():
+            self._next_turn.reset()
+
+    def _take_turn(self) -> None:
+        """Works on the oldest message of whose turn it is; others of theirs wait until everybody has had a turn."""
+        if self._turns:
+            person = next(iter(self._turns))
+            topic, waiting = self._inputs[person].topic_name, self._turns.pop(person)
+            data = waiting.popleft()
+            if waiting:
+                self._turns[person] = waiting
+            self._node.guarded(topic, self._on_input)(person, topic, data)
+        if not self._turns:
+            self._next_turn.cancel()
+
+    def _on_input(self, person: str, topic: str, data: bytes) -> None:
+        node = self._node
+        if self.scene is None:
+            return
         if not node.is_watched():
             node.statistics.count("skip.unwatched")
             return
@@ -279,6 +313,7 @@ class Listener:
         bodies = self._bodies()
         for person in [person for person in self._inputs if not person.startswith("/") and person not in bodies]:
             self._node.destroy_subscription(self._inputs.pop(person))
+            self._turns.pop(person, None)
             self.doubts.forget(person)
         for person, topic in bodies.items():
             if person not in self._inputs:

@@ -13,6 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from refu_core._collector import collect_rarely, keep_what_is_loaded
+
 EXIT_BAD_INPUT = 2
 _LOOK_UP_S = 0.25
 """How often the main thread looks for a signal when nothing happens."""
@@ -30,6 +32,7 @@ def run(
 ) -> int:
     """Answers --help with a `listing` of parameters and topics, or starts rclpy and runs `live`; returns the status."""
     _on_signals(signal.SIG_DFL)  # while it loads, nothing is open that would have to be closed
+    collect_rarely()
     try:
         import rclpy
         from rclpy.signals import SignalHandlerOptions
@@ -87,6 +90,7 @@ def spin(node: Any, *, until: Callable[[], object]) -> None:
     """Lets a `GuardedNode` answer what comes. Callbacks are guarded; what rclpy itself raises mustn't end it either."""
     executor = make_executor()
     executor.add_node(node)
+    keep_what_is_loaded()
     spin_once = node.guarded("executor", executor.spin_once, lambda *_, **__: time.sleep(_BREATH_S))
     while not until():
         spin_once(timeout_sec=_LOOK_UP_S)

@@ -94,9 +94,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """What has been imported stays: a collector that goes through it again and again took a tenth of the time."""
+    from refu_core._collector import collect_rarely, keep_what_is_loaded
+
     gc.collect()
-    gc.freeze()
-    gc.set_threshold(50_000, 20, 20)
+    keep_what_is_loaded()
+    collect_rarely()
 
 
 class Unable(pytest.Module):

@@ -25,6 +25,7 @@ CORE = (
         "_files",
         "_npz",
         "_cache",
+        "_collector",
         "_device",
         "_kernel_cache",
         "_versions",

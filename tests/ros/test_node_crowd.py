@@ -21,7 +21,9 @@ from msg_adapters.scene import Scene
 from refu_core import load_body
 from refu_core.keypoints import MOST_PEOPLE, Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
+from refu_ros._listener import INPUT_QOS
 from refu_ros._node import GarmentNode
+from refu_ros._program import make_executor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -76,6 +78,28 @@ def test_who_has_left_a_tracker_is_forgotten(node: Any, monkeypatch: pytest.Monk
     assert len(listener._frames) == MOST_PEOPLE
     assert listener._frames[f"p{MOST_PEOPLE + 9}"] == "camera"  # who came first is forgotten
     assert "p9" not in listener._frames
+
+
+def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Timers and requests waited behind all messages that had come: twenty seconds, with a crowd's keypoints."""
+    executor, done, listener = make_executor(), list[bytes | str](), node._listener
+    executor.add_node(node)
+    monkeypatch.setattr(listener, "_on_input", lambda person, topic, data: done.append(data))  # noqa: ARG005
+    listener.scene = Scene(node.statistics)
+    listener.subscribe()
+    for i in range(100):
+        listener._come("", "/smpl_params", bytes([i]))
+    others = 20
+    for _ in range(others):
+        executor.create_task(lambda: done.append("other"))
+    while len(done) < INPUT_QOS.depth + others:
+        executor.spin_once(timeout_sec=0.1)
+    assert [one for one in done if one != "other"] == [bytes([i]) for i in range(95, 100)]
+    assert done.index(b"\x60") > done.index("other")  # not one message after another
+    report = node.statistics.report()
+    assert (report.total["received"], report.total["drop.stale"]) == (100, 100 - INPUT_QOS.depth)
+    listener.unsubscribe()
+    executor.remove_node(node)
 
 
 def test_a_crowd_of_bodies_and_a_long_name_take_nothing_from_others(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
