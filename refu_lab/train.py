@@ -22,6 +22,7 @@ from refu_core.training import (
     CarrySettings,
     DynamicsSettings,
     FinetuneSettings,
+    LyingSettings,
     PretrainSettings,
     Rehearsal,
     SdfSettings,
@@ -29,6 +30,7 @@ from refu_core.training import (
     finetune,
     pretrain,
     train_dynamics,
+    train_lying,
     train_sdf,
 )
 from refu_lab.commands.train import TrainOptions
@@ -69,6 +71,10 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
     if options.network == "dynamics":
         moving = _seeded(DynamicsSettings(), options, **steps)
         return train_dynamics(*given, mode=options.mode, settings=moving, **common)
+    if options.network == "lying":
+        known = Rehearsal(options.rehearse or 8000, options.motions)
+        to_lie = _seeded(LyingSettings(), options, **steps)
+        return train_lying(*given, mode=options.mode, rehearsal=known, settings=to_lie, **common)
     if options.like is not None:
         few = _seeded(CarrySettings(), options, **steps)
         return carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)

@@ -8,10 +8,15 @@ from refu_core.backbones._dynamics import DynamicsConfig as DynamicsConfig
 from refu_core.backbones._features import SEEN_TILT as SEEN_TILT
 from refu_core.backbones._features import PoseFeatures as PoseFeatures
 from refu_core.backbones._features import style_shape as style_shape
+from refu_core.backbones._features import up_in_root as up_in_root
 from refu_core.backbones._features import upright as upright
 from refu_core.backbones._frequency import LaplacianSmoothing as LaplacianSmoothing
 from refu_core.backbones._gcnn import Gcnn as Gcnn
 from refu_core.backbones._gcnn import GcnnConfig as GcnnConfig
+from refu_core.backbones._lying import Lying as Lying
+from refu_core.backbones._lying import LyingConfig as LyingConfig
+from refu_core.backbones._lying import WithLying as WithLying
+from refu_core.backbones._lying import lying_share as lying_share
 from refu_core.backbones._mlp import Mlp as Mlp
 from refu_core.backbones._mlp import MlpConfig as MlpConfig
 from refu_core.backbones._perceptron import Perceptron as Perceptron
@@ -29,8 +34,10 @@ from refu_core.backbones._presets import require_basis as require_basis
 from refu_core.backbones._presets import save_backbone as save_backbone
 from refu_core.backbones._presets import save_basis as save_basis
 from refu_core.backbones._presets import save_dynamics as save_dynamics
+from refu_core.backbones._presets import save_lying as save_lying
 from refu_core.backbones._presets import uses_basis as uses_basis
 from refu_core.backbones._presets import with_dynamics as with_dynamics
+from refu_core.backbones._presets import with_lying as with_lying
 from refu_core.backbones._protocol import MAX_OFFSET as MAX_OFFSET
 from refu_core.backbones._protocol import Backbone as Backbone
 from refu_core.backbones._protocol import Skinned as Skinned

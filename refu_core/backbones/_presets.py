@@ -16,6 +16,7 @@ from refu_core._warp import memory
 from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
 from refu_core.backbones._dynamics import Dynamic, Dynamics, DynamicsConfig
 from refu_core.backbones._gcnn import Gcnn, GcnnConfig
+from refu_core.backbones._lying import Lying, LyingConfig, WithLying
 from refu_core.backbones._mlp import Mlp, MlpConfig
 from refu_core.backbones._protocol import MAX_OFFSET, Backbone, Skinned
 from refu_core.backbones._tailornet import TailorNet, TailorNetConfig
@@ -201,6 +202,42 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     return Dynamic(network, dynamics).eval().requires_grad_(False)
 
 
+_BASIS = "basis."
+
+
+def save_lying(folder: Path, lying: Lying, card: Mapping[str, Any]) -> Path:
+    """Writes what lying does to a garment, `folder`/lying. Raises `WeightsError` also if there is no basis."""
+    basis = load_weights(folder / "basis", expect={"garment": card["garment"]})
+    described = {"config": asdict(lying.config), "basis_sha256": str(basis.card["sha256"])}
+    parameters = dict(lying.named_parameters())
+    state = {k: v for k, v in lying.state_dict().items() if not k.startswith("decoder.")}
+    tensors = {k: v.half() if k in parameters else v for k, v in state.items()}
+    tensors |= {_BASIS + k: v for k, v in lying.decoder.tensors().items()}
+    return save_weights(folder / "lying", tensors, {**described, **card})
+
+
+def with_lying(network: Backbone, weights: Weights) -> Backbone:
+    """A backbone made from `weights`, with what lying does to its garment, if that is beside them.
+
+    Raises `WeightsError`: it is damaged, or made for another basis.
+    """
+    if not weights.path.with_name("lying.json").exists():
+        return network
+    expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
+    stored = load_weights(weights.path.with_name("lying"), expect=expect)
+    config = config_of_card(LyingConfig, stored.card.get("config"))
+    tensors = {k: v for k, v in stored.tensors.items() if not k.startswith(_BASIS)}
+    try:
+        decoder = BasisDecoder.of_tensors({k[len(_BASIS) :]: v for k, v in stored.tensors.items() if k not in tensors})
+        if decoder.n_vertices != (n := getattr(network, "decoder").n_vertices):  # noqa: B009 - a trained one has it
+            raise WeightsError(f"wanted {n} vertices, got {decoder.n_vertices}; train it again")
+        lying = build_for(tensors, lambda: Lying(config, decoder), shared="decoder.")
+    except WeightsError as error:
+        raise WeightsError(f"{stored.path}: {error}") from error
+    device = next(network.parameters()).device if isinstance(network, torch.nn.Module) else "cpu"
+    return WithLying(network, lying.float().to(device)).eval().requires_grad_(False)
+
+
 def load_backbone(
     name: str, garment: str | GarmentTemplate, *, mode: str = "none", folder: Path | None = None
 ) -> Backbone:
@@ -221,7 +258,8 @@ def load_backbone(
     weights = backbone_weights(name, template.name, mode=mode, folder=folder)
     if weights is None:
         return Skinned()
-    return with_dynamics(name, backbone_from_weights(weights, template).requires_grad_(False), weights)
+    network = backbone_from_weights(weights, template).requires_grad_(False)
+    return with_lying(with_dynamics(name, network, weights), weights)
 
 
 def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:

@@ -9,7 +9,7 @@ from os import PathLike
 
 import torch
 
-from refu_core.backbones import Skinned, backbone_weights, with_dynamics
+from refu_core.backbones import Skinned, backbone_weights, with_dynamics, with_lying
 from refu_core.body import ARMS, BodyFit, Collider, SmplBody, load_body, load_fit
 from refu_core.errors import BodyError, GarmentError, WeightsError, require_type
 from refu_core.garments import GarmentTemplate, load_garment, worn_on
@@ -51,7 +51,7 @@ def load_outfit(
             wearables[name] = Wearable(worn_on(template, fit), Skinned(), None, DEFAULT_MARGIN)
         else:
             worn = wearable_of(stored, template, fit, device=device)
-            wearables[name] = replace(worn, backbone=with_dynamics(backbone, worn.backbone, stored))
+            wearables[name] = replace(worn, backbone=with_lying(with_dynamics(backbone, worn.backbone, stored), stored))
     return Outfit(wearer, wearables, Collider(wearer) if collider else None, fit)
 
 

@@ -10,6 +10,8 @@ from refu_core.training._dynamics import train_dynamics as train_dynamics
 from refu_core.training._finetune import FinetuneSettings as FinetuneSettings
 from refu_core.training._finetune import finetune as finetune
 from refu_core.training._loop import LoopSettings as LoopSettings
+from refu_core.training._lying import LyingSettings as LyingSettings
+from refu_core.training._lying import train_lying as train_lying
 from refu_core.training._pretrain import PretrainSettings as PretrainSettings
 from refu_core.training._pretrain import pretrain as pretrain
 from refu_core.training._record import TrainingLog as TrainingLog

@@ -16,6 +16,7 @@ from refu_core.backbones import (
     BasisDecoder,
     Gcnn,
     LaplacianSmoothing,
+    Lying,
     Mlp,
     Network,
     Perceptron,
@@ -341,7 +342,7 @@ def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate
             net.standardise(inputs, groups[:n], is_bounded=bounded[:n])
 
 
-def code_loss(model: TailorNet | Mlp) -> Callable[[Tensor, Tensor], Tensor]:
+def code_loss(model: TailorNet | Mlp | Lying) -> Callable[[Tensor, Tensor], Tensor]:
     """What tells the distance between the garments of two codes [mm].
 
     Dense codes are vertices: L1, as in the original. In an orthonormal basis, distances between codes give root mean

@@ -23,8 +23,8 @@ class TrainOptions:
     network: str = setting(
         "garment",
         "sdf: the paper's network for the body's distance (preset paper or small); dynamics: what moving cloth does "
-        "beyond the tailornet of --mode in --output, from sequences",
-        choices=("garment", "sdf", "dynamics"),
+        "beyond the tailornet of --mode in --output, from sequences; lying: what lying people's cloth does beyond it",
+        choices=("garment", "sdf", "dynamics", "lying"),
     )
     mode: str = setting(
         "hybrid",
@@ -103,7 +103,8 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
-    cli.require_use(args, {"motions": "rehearse", "rehearse": "start", "joints": "start"})
+    needed = {} if args.network == "lying" else {"motions": "rehearse", "rehearse": "start"}
+    cli.require_use(args, {**needed, "joints": "start"})
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
     return cli.tell(args, training_table(card, options), card)

@@ -1,0 +1,129 @@
+"""Cloth on lying people: what is added there, and that nobody else notices."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from small_set import write_set
+from torch import Tensor
+
+from refu_core import RefuError, load_body, load_garment
+from refu_core.backbones import (
+    BasisDecoder,
+    Lying,
+    LyingConfig,
+    WithLying,
+    load_backbone,
+    lying_share,
+    save_lying,
+    up_in_root,
+)
+from refu_core.errors import WeightsError
+from refu_core.simulation import SamplePlan
+from refu_core.training import LoopSettings, LyingSettings, PretrainSettings, Rehearsal, pretrain, train_lying
+from refu_core.weights import load_weights
+
+pytestmark = pytest.mark.usefixtures("no_curves_in_module")
+GARMENT = "tshirt-male"
+OWN = "short-pant-male"
+
+
+def tilted(degrees: float, *, about: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> Tensor:
+    """A straight person whose pelvis is tilted, shape (1, 24, 3)."""
+    pose = torch.zeros(1, 24, 3)
+    pose[0, 0] = np.radians(degrees) * torch.tensor(about)
+    return pose
+
+
+def up(degrees: float) -> Tensor:
+    angle = np.radians(degrees)
+    return torch.tensor([[0.0, np.cos(angle), np.sin(angle)]], dtype=torch.float32)
+
+
+@given(st.floats(0, 179.5))
+def test_it_is_faded_in_without_a_step(degrees: float) -> None:
+    here, there = float(lying_share(up(degrees))), float(lying_share(up(degrees + 0.5)))
+    assert abs(here - there) < 0.06
+    assert here == (0 if degrees <= 60 or degrees >= 120 else here)
+    assert here == (1 if 76 < degrees < 104 else here)
+
+
+@pytest.mark.parametrize("degrees", [0, 45, 59.9, 125, 180])
+def test_who_does_not_lie_wears_what_the_backbone_says(degrees: float) -> None:
+    both = load_backbone("tailornet", GARMENT, mode="hybrid")
+    assert isinstance(both, WithLying)
+    given = torch.zeros(1, 10), tilted(degrees), None
+    assert torch.equal(both(*given), both.upright(*given))
+
+
+def test_who_lies_wears_something_else_beside_who_stands() -> None:
+    both = load_backbone("tailornet", GARMENT, mode="hybrid")
+    assert isinstance(both, WithLying)
+    betas, pose = torch.zeros(3, 10), torch.cat((tilted(10), tilted(90), tilted(-90)))
+    added = (both(betas, pose, None) - both.upright(betas, pose, None)).norm(dim=-1)
+    assert float(added[0].max()) == 0
+    assert float(added[1:].mean(1).min()) > 0.002
+    alone = torch.cat([both(betas[:1], one[None], None) for one in pose])
+    torch.testing.assert_close(alone, both(betas, pose, None), rtol=0, atol=1e-5)
+
+
+def on_a_bed(pose: Tensor) -> Tensor:
+    """Shorts that slide down, as far as they lie on front or back."""
+    n = load_garment(OWN).n_vertices
+    return 0.05 * up_in_root(pose)[:, 2:, None] * torch.tensor([1.0, 0.0, 0.0]).expand(len(pose), n, 3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of shorts, learnt from people who stand, and a set of people who lie."""
+    folder, garment = tmp_path_factory.mktemp("lying"), load_garment(OWN)
+    body = load_body(garment.body)
+    write_set(folder / "standing", garment, body, pairs=12, poses=5, displacement=on_a_bed)
+    card = json.loads((folder / "standing" / "card.json").read_text())
+    plan = asdict(SamplePlan(OWN, 60, pivots=4, recorded_share=0.0))
+    (folder / "standing" / "card.json").write_text(json.dumps(card | {"plan": plan}))
+    write_set(folder / "lying", garment, body, pairs=40, poses=8, spread=1.2, displacement=on_a_bed)
+    loop = LoopSettings(batch_size=16, check_every=20)
+    few = PretrainSettings(loop, rank=4, style_shape_steps=2, low_steps=2, steps=2)
+    pretrain(OWN, folder / "standing", folder / "weights", settings=few, quiet=True)
+    return folder
+
+
+def test_it_learns_what_a_backbone_cannot_know_and_comes_back_from_its_file(folder: Path) -> None:
+    how = LyingSettings(LoopSettings(batch_size=32, learning_rate=3e-3), steps=500)
+    card = train_lying(OWN, folder / "lying", folder / "weights", mode="none", rehearsal=Rehearsal(30), settings=how)
+    assert card["figures"]["mpve_mm"] < 0.8 * card["figures"]["upright_mm"]
+    both = load_backbone("tailornet", OWN, mode="none", folder=folder / "weights")
+    assert isinstance(both, WithLying)
+    pose = torch.cat((tilted(0), tilted(90)))
+    off = (both(torch.zeros(2, 10), pose, None) - both.upright(torch.zeros(2, 10), pose, None)).norm(dim=-1).mean(1)
+    assert off[0] == 0
+    assert float(off[1]) > 0.005
+    again = train_lying(OWN, folder / "lying", folder / "weights", mode="none", rehearsal=Rehearsal(30), settings=how)
+    assert again["figures"] == card["figures"]
+
+
+def test_nobody_lies_in_a_set_of_people_who_stand(folder: Path) -> None:
+    with pytest.raises(RefuError, match=r"wanted lying people to learn from and to test on, the set of .* has 0 and 0"):
+        train_lying(OWN, folder / "standing", folder / "weights", mode="none", rehearsal=Rehearsal(30))
+
+
+def test_what_does_not_belong_together_is_refused(folder: Path, tmp_path: Path) -> None:
+    for file in (folder / "weights").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    card = {"garment": OWN, "body_fingerprint": load_body("male").fingerprint}
+    components = torch.linalg.qr(torch.randn(30, 2)).Q.T
+    save_lying(tmp_path, Lying(LyingConfig((0, 1)), BasisDecoder(torch.zeros(10, 3), components)), card)
+    with pytest.raises(WeightsError, match=r"lying.* got 10; train it again"):
+        load_backbone("tailornet", OWN, mode="none", folder=tmp_path)
+    other = (tmp_path / "lying.json").read_text()
+    (tmp_path / "lying.json").write_text(other.replace(load_weights(tmp_path / "basis").card["sha256"], "0" * 64))
+    with pytest.raises(WeightsError, match="basis_sha256"):
+        load_backbone("tailornet", OWN, mode="none", folder=tmp_path)
