@@ -6,10 +6,10 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Collection, Mapping
-from functools import cache
+from collections.abc import Callable, Collection, Mapping
+from functools import cache, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,39 @@ from numpy.typing import NDArray
 from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.errors import RefuError
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def remembered(most: int) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Has a function of NumPy arrays remember its last `most` results, for arguments of the same content.
+
+    Whoever gets a result shares it with others, and mustn't change it.
+    """
+
+    def wrap(of: Callable[_P, _T]) -> Callable[_P, _T]:
+        known: dict[Any, _T] = {}
+
+        @wraps(of)
+        def call(*arguments: _P.args, **options: _P.kwargs) -> _T:
+            key = _content([*arguments, *options.items()])
+            found = known.pop(key, None)
+            found = of(*arguments, **options) if found is None else found
+            known[key] = found  # the newest is the last
+            while len(known) > most:
+                known.pop(next(iter(known)), None)
+            return found
+
+        return call
+
+    return wrap
+
+
+def _content(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str, hashlib.blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
+    return tuple(map(_content, value)) if isinstance(value, (list, tuple)) else value
 
 
 def cache_folder() -> Path:

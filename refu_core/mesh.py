@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from refu_core._cache import remembered
 from refu_core.errors import MeshError
 
 _Float = TypeVar("_Float", np.float32, np.float64)
@@ -43,7 +44,7 @@ class Connectivity:
     def of(cls, faces: Any, n_vertices: int | None = None) -> Connectivity:
         """For `faces`, integers of shape (F, 3), and by default as many vertices as they name; raises `MeshError`."""
         checked = check_faces(faces, n_vertices=n_vertices)
-        return cls(checked, int(checked.max()) + 1 if n_vertices is None else n_vertices)
+        return _connectivity(checked, int(checked.max()) + 1 if n_vertices is None else n_vertices)
 
     @cached_property
     def _edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -85,6 +86,7 @@ class Connectivity:
         """The faces around each vertex."""
         return _grouped(self.faces.ravel(), np.repeat(np.arange(len(self.faces)), 3), self.n_vertices)
 
+    @cached_property
     def independent(self) -> NDArray[np.bool_]:
         """A maximal independent set, shape (V,): no edge joins two of its vertices, and every other is next to one."""
         is_free, chosen = np.ones(self.n_vertices, np.bool_), np.zeros(self.n_vertices, np.bool_)
@@ -97,6 +99,12 @@ class Connectivity:
 
     def require_closed(self) -> None:
         """Raises `MeshError` where the mesh isn't a closed, consistently oriented surface."""
+        if self._fault:
+            raise MeshError(self._fault)
+
+    @cached_property
+    def _fault(self) -> str:
+        """Why the mesh isn't closed; empty if it is."""
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         n_faces = self.n_faces_of_edge
         n_open, n_crowded = int((n_faces == 1).sum()), int((n_faces > 2).sum())
@@ -107,7 +115,8 @@ class Connectivity:
                 f"{n_open} open edges, {n_crowded} edges of more than two faces and {n_flipped} edges whose two faces "
             )
             fault = f"{edges}face opposite ways; close the mesh and orient its faces outward"
-            raise MeshError(f"a signed distance needs a watertight body: {fault}")
+            return f"a signed distance needs a watertight body: {fault}"
+        return ""
 
     @cached_property
     def across(self) -> NDArray[np.int32]:
@@ -132,6 +141,11 @@ class Connectivity:
         adjacent = self.adjacency_matrix()
         degree = np.maximum(adjacent.sum(axis=1), 1.0)
         return sparse.csr_array(sparse.eye_array(self.n_vertices) - sparse.diags_array(1.0 / degree) @ adjacent)
+
+
+@remembered(16)  # a person's body and clothes are asked about by every part of a pipeline
+def _connectivity(faces: NDArray[np.int32], n_vertices: int) -> Connectivity:
+    return Connectivity(faces.copy(), n_vertices)  # the caller's may change
 
 
 def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int32]:
@@ -210,6 +224,7 @@ def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
     return Adjacency(start.astype(np.int32), items[order].astype(np.int32))
 
 
+@remembered(16)
 def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int64]:
     """An order of places (N, 3) in which every eight (or `width`) in a row, every 64, and so on are close together."""
     n = len(places)

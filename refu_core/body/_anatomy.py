@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from refu_core._cache import remembered
 from refu_core._warp import as_warp, memory
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
@@ -279,6 +280,7 @@ def _paths(weights: NDArray[np.float64], of_vertex: NDArray[np.int32]) -> NDArra
     )
 
 
+@remembered(4)
 def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
     """Unit normals at the vertices (V, 3) [m], levelled over two rings."""
     normals, ring = vertex_normals(vertices, mesh.faces), mesh.ring

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
+from refu_core._cache import remembered
 from refu_core._warp import ints
 from refu_core.body._bundle_kernels import Bundles
 from refu_core.mesh import grouped
@@ -20,6 +21,21 @@ _SIZE = 64
 
 def bundled(rest: NDArray[np.floating[Any]], faces: Sequence[NDArray[np.integer[Any]]], device: torch.device) -> Any:
     """`Bundles` of groups of faces, (F_k, 3) each, bundled by how near they lie in the pose `rest` (V, 3) [m]."""
+    first, corners = _corners(rest, faces)
+    bundles = Bundles()
+    bundles.first, bundles.start, bundles.corner = (
+        ints(values, device) for values in (first, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
+    )
+    bundles.low, bundles.high = (wp.zeros(len(corners), dtype=wp.vec3, device=str(device)) for _ in range(2))
+    bundles.group_low, bundles.group_high = (wp.zeros(len(faces), dtype=wp.vec3, device=str(device)) for _ in range(2))
+    return bundles
+
+
+@remembered(8)
+def _corners(
+    rest: NDArray[np.floating[Any]], faces: Sequence[NDArray[np.integer[Any]]]
+) -> tuple[list[int], list[NDArray[np.integer[Any]]]]:
+    """The first bundle of each group, and the number of all bundles; the vertices of each bundle."""
     corners: list[NDArray[np.integer[Any]]] = []
     first = [0]
     for of_group in faces:
@@ -28,10 +44,4 @@ def bundled(rest: NDArray[np.floating[Any]], faces: Sequence[NDArray[np.integer[
             np.unique(of_group[some]) for some in np.array_split(order, max(1, len(order) // _SIZE)) if len(some)
         ]
         first.append(len(corners))
-    bundles = Bundles()
-    bundles.first, bundles.start, bundles.corner = (
-        ints(values, device) for values in (first, np.cumsum([0, *map(len, corners)]), np.concatenate(corners))
-    )
-    bundles.low, bundles.high = (wp.zeros(len(corners), dtype=wp.vec3, device=str(device)) for _ in range(2))
-    bundles.group_low, bundles.group_high = (wp.zeros(len(faces), dtype=wp.vec3, device=str(device)) for _ in range(2))
-    return bundles
+    return first, corners

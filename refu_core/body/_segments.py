@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core._cache import remembered
 from refu_core.body._parts import joints_of
 from refu_core.mesh import linked, rim_of
 
@@ -58,6 +59,7 @@ def segment_of_face(faces: NDArray[np.integer], share: NDArray[np.float64]) -> N
     return found
 
 
+@remembered(4)
 def cut(faces: NDArray[np.int32], share: NDArray[np.float64]) -> Solids:
     """Cuts a mesh of faces (F, 3) by the `share` that each vertex has in each segment, (V, K)."""
     n_vertices, n_segments = share.shape

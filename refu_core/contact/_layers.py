@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from refu_core._cache import remembered
 from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact._parting import Parting
@@ -117,6 +118,7 @@ def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
     return rules
 
 
+@remembered(4)
 def _starts(
     above: NDArray[np.float32], below: NDArray[np.float32], mesh: Connectivity, settings: ContactSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -125,15 +127,16 @@ def _starts(
     A vertex that isn't near the sheet at rest has none. Vertices of the sheet without a face lead nowhere.
     """
     has_face = np.unique(mesh.faces)
-    tree, is_free, places = cKDTree(below[has_face]), np.ones(len(has_face), np.bool_), []
+    tree, is_free, chosen = cKDTree(below[has_face]), np.ones(len(has_face), np.bool_), []
     for i, vertex in enumerate(has_face):
         if is_free[i]:
-            places.append(vertex)
+            chosen.append(vertex)
             is_free[tree.query_ball_point(below[vertex], settings.layer_reach)] = False
+    places = np.array(chosen)
     distance, closest = (np.asarray(found) for found in tree.query(above))
     around = cKDTree(below[places]).query_ball_point(above, settings.max_displacement)
     each = [
-        np.append(first, np.array(places)[others]) if near else np.zeros(0, np.int64)
+        np.append(first, places[others]) if near else np.zeros(0, np.int64)
         for first, others, near in zip(has_face[closest], around, distance < settings.max_displacement, strict=True)
     ]
     found = np.concatenate((*each, np.zeros(0, np.int64))).astype(np.int64)

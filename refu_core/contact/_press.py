@@ -92,7 +92,7 @@ class Press:
         # Cloth that lies on the skin gives way as one piece: only some of its vertices are tested, and others follow.
         rest = garment.v_template.cpu().numpy()
         is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.limb_reach
-        is_asked = is_loose | garment.mesh.independent()
+        is_asked = is_loose | garment.mesh.independent
         order, ring = grouped(rest), garment.mesh.ring
         order = order[is_asked[order]]
         fabric = kernels.Fabric()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
 
 from refu_core import MeshError, load_garment
+from refu_core._cache import remembered
 from refu_core.mesh import Connectivity
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
@@ -79,9 +82,35 @@ def test_what_isnt_closed_is_refused(faces: np.ndarray, wanted: str) -> None:
 
 def test_an_independent_set_is_one_and_leaves_nobody_alone(reference: trimesh.Trimesh) -> None:
     mesh = Connectivity.of(reference.faces)
-    chosen = mesh.independent()
+    chosen = mesh.independent
     ends = chosen[mesh.edges]
     assert not ends.all(axis=1).any()
     is_beside = np.zeros(mesh.n_vertices, np.bool_)
     np.logical_or.at(is_beside, mesh.edges, ends[:, ::-1])
     assert (chosen | is_beside).all()
+
+
+def test_what_is_remembered_is_what_is_computed() -> None:
+    """By content: arrays that have changed are other arguments, and a caller's array is the caller's."""
+    calls = []
+
+    @remembered(2)
+    def doubled(values: Any, by: float = 2.0) -> Any:
+        calls.append(by)
+        return by * values
+
+    values = np.arange(3.0)
+    first = doubled(values)
+    assert doubled(values.copy()) is first
+    values[0] = 5.0
+    np.testing.assert_array_equal(doubled(values), 2 * values)
+    np.testing.assert_array_equal(doubled(values, by=3.0), 3 * values)  # the oldest is forgotten
+    assert len(calls) == 3
+    doubled(np.arange(3.0))
+    assert len(calls) == 4
+    faces = np.array([[0, 1, 2]], np.int32)
+    mesh = Connectivity.of(faces, 3)
+    faces[:] = [[2, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+    assert Connectivity.of(faces, 3) is not mesh
+    assert Connectivity.of(mesh.faces, 3) is mesh

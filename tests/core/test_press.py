@@ -79,7 +79,7 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool, was_pushed: bool) -
     of_face = part_of_faces(outfit().body.weights, outfit().body.faces, parts).numpy()
     rest = outfit().wearables[SKIRT].template.v_template.numpy()
     to_skin = cKDTree(outfit().body.v_template.numpy()).query(rest)[0]
-    is_asked = outfit().wearables[SKIRT].template.mesh.independent() | (to_skin > DEFAULT_CONTACT.limb_reach)
+    is_asked = outfit().wearables[SKIRT].template.mesh.independent | (to_skin > DEFAULT_CONTACT.limb_reach)
     how, moved = DEFAULT_CONTACT, np.linalg.norm(pressed - x, axis=1)
     farthest = outfit().wearables[SKIRT].template.edge_length if knows_arms else how.limb_reach
     room, slack = how.gap, 0.0
