@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 
 from refu_core.body import JOINT_NAMES
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import components, rim_vertices
+from refu_core.fitting._clean import clean, components, partners, rim_vertices
 from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._surround import sample
 from refu_core.frames import N_JOINTS
-from refu_core.mesh import face_normals
+from refu_core.mesh import face_normals, linked
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,6 +35,14 @@ _SHARE = 0.1
 """Least share of a piece's rim that has to be that near to another piece's rim."""
 _LARGE = 0.05
 """Least share of a mesh's area that each of several garments in it has."""
+_THIN, _SIDE = 0.1, 0.4
+"""Cloth is thinner than `_THIN` of the edge of a square of its area, a ball has 0.27; each of its two sides has
+more than `_SIDE` of all its area, and its hems have the rest."""
+_N_AROUND = 24
+"""How many of `_N_NEAR` points on a mesh tell how cloth lies around a face: those within some 4 cm."""
+_ALONG = 0.8
+"""Least cosine between a face's normal and theirs, either way: faces of a hem have less. 0.7 to 0.9 found both sides of
+garments 1.5 to 12 mm thick, with jagged hems; with 0.5, a face of a hem joined the sides of most."""
 _BETWEEN = 0.02
 """Parts farther than this from each other [m] along the body are two garments."""
 
@@ -99,6 +107,48 @@ def without_bodies(mesh: SurfaceMesh, vertices: F64, posed: PosedBody) -> tuple[
         notes.append(f"{n_eyes} small pieces nearer to it than to its clothes, as eyes are, were left out, too")
     height = float(np.ptp(vertices[is_body[label], 1]))
     return mesh.only(~gone[of_face]).compact(), notes, height
+
+
+def outer_sides(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, list[str]]:
+    """The mesh, in metres on a body, with the outer sides alone of pieces that are cloth with two sides, and a note.
+
+    Contact would bring both sides to the same distance from the skin, where the inner one shows through the outer; and
+    simulated sides pass through each other, because what is near at rest makes no contact.
+
+    Such a piece is closed and thin. Its sides are joined by hems, whose faces stand across the cloth around them.
+    """
+    faces, (n_pieces, label) = mesh.faces, components(mesh.faces, len(mesh.vertices))
+    piece, is_closed = label[faces[:, 0]], ~np.isin(np.arange(n_pieces), label[rim_vertices(faces)])
+    normals, centres = face_normals(mesh.vertices, faces), mesh.vertices[faces].mean(1)
+    twice = np.linalg.norm(normals, axis=1)
+    area = np.bincount(piece, twice) / 2
+    thickness = np.abs(np.bincount(piece, ((centres - centres.mean(0)) * normals).sum(1))) / 3 / area
+    thick = np.flatnonzero(is_closed & (thickness < _THIN * np.sqrt(area / 2)))
+    if not len(thick):
+        return mesh, []
+    points = sample(mesh, _N_NEAR)
+    around = points.normals[cKDTree(points.points).query(centres, k=_N_AROUND)[1]]
+    across = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)[1][:, :, -1]
+    is_side = np.abs((normals * across).sum(1)) > _ALONG * twice
+    pairs = partners(mesh)[0] // 3
+    n_parts, part = linked(pairs[np.equal(*is_side[pairs].T)], len(faces))
+    gone = np.zeros(len(faces), np.bool_)
+    for k in thick:
+        own = piece == k
+        size = np.bincount(part[own & is_side], twice[own & is_side], n_parts) / 2
+        sides = np.argsort(-size)[:2]
+        if size[sides].min() > _SIDE * area[k]:
+            off = [np.average(posed(centres[part == side])[0], weights=twice[part == side]) for side in sides]
+            outer = sides[int(np.argmax(off))]
+            ends = part[pairs[own[pairs[:, 0]]]]
+            ends = np.concatenate((ends, ends[:, ::-1]))[np.tile(np.not_equal(*ends.T), 2)]
+            beside, between = ends[ends[:, 1] == outer, 0], ends[ends[:, 1] != outer, 0]
+            gone |= own & ~np.isin(part, [outer, *np.setdiff1d(beside, between)])  # creases stay, hems don't
+    if not gone.any():
+        return mesh, []
+    note = f"cloth with two sides, of which the outer one is worn ({len(np.unique(piece[gone]))} of {n_pieces} pieces)"
+    mesh, notes = clean(mesh.only(~gone).compact())  # panels that only touched have rims now, and are sewn
+    return mesh, [note, *notes]
 
 
 def unsewn(mesh: SurfaceMesh) -> list[str]:
