@@ -83,8 +83,10 @@ def without_bodies(mesh: SurfaceMesh, vertices: F64, posed: PosedBody) -> tuple[
     """
     n_pieces, label = components(mesh.faces, len(vertices))
     joint = posed.body.weights.argmax(1).numpy()[posed.body.faces[:, 0].numpy()]
-    has = np.zeros((n_pieces, N_JOINTS), np.bool_)
-    has[label, joint[posed.closest(vertices)[0]]] = True
+    near, has = joint[posed.closest(vertices)[0]], np.zeros((n_pieces, N_JOINTS), np.bool_)
+    is_high = vertices[:, 1] > float(posed.body.joint_template[_ENDS[0], 1])
+    counts = (near != _ENDS[0]) | is_high  # a collar at the chin is no head
+    has[label[counts], near[counts]] = True
     is_body = np.all(has[:, _ENDS], axis=1)
     for piece in np.flatnonzero(is_body):
         is_body[piece] = np.median(np.abs(posed(vertices[label == piece])[0])) < _ON_SKIN
