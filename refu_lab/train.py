@@ -129,10 +129,13 @@ def _seeded(settings: Any, options: TrainOptions, **changes: Any) -> Any:
 
 def training_table(card: dict[str, Any], options: TrainOptions) -> str:
     """What `refu train` prints."""
-    rows = [(name, str(card[name])) for name in ("backbone", "mode", "preset", "like", "samples") if name in card]
-    rows += [
-        (name.replace("_", " "), f"{value:.3f}")
-        for name, value in card.get("figures", {}).items()
-        if isinstance(value, (int, float))
-    ]
+    named = [name for name in ("backbone", "mode", "preset", "like") if name in card]
+    rows: list[tuple[str, str]] = [(name, str(card[name])) for name in named]
+    # Mirrored ones count, too, where they were learnt from.
+    rows += [("training samples", str(card["samples"]))] if "samples" in card else []
+    for name, value in card.get("figures", {}).items():
+        if isinstance(value, int):
+            rows.append((f"test {name}", str(value)))
+        elif isinstance(value, float):
+            rows.append((name.replace("_", " "), f"{value:.3f}"))
     return format_table((options.garment, str(options.folder)), rows)

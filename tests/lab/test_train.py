@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,7 @@ def test_the_figures_are_printed(weights: Path, data: Path, capsys: pytest.Captu
     out = capsys.readouterr().out
     assert "mpve mm" in out
     assert "backbone" in out
+    assert all(re.search(rf"{split} samples +\d+\n", out) for split in ("training", "test"))
 
 
 def test_variants(data: Path, weights: Path) -> None:
