@@ -17,7 +17,7 @@ from refu_core.errors import printable
 from refu_core.garments import worn_on
 from refu_core.options import check
 from refu_core.sdf import SDF_PRESETS
-from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, load_clips, open_dataset
 from refu_core.training import (
     CarrySettings,
     DynamicsSettings,
@@ -77,7 +77,8 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
     first = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
     first = _seeded(first, options, **of_all)
     if options.start is not None:
-        rehearsal = None if options.rehearse is None else Rehearsal(options.rehearse, options.motions)
+        motions = options.motions and load_clips(options.motions, axes=options.input_axes, fps=options.fps)
+        rehearsal = None if options.rehearse is None else Rehearsal(options.rehearse, motions)
         common |= {"start": options.start, "mode": options.mode, "joints": _numbers(options.joints)}
         return pretrain(*given, settings=first, rehearsal=rehearsal, **common)
     if options.mode == "none":

@@ -119,6 +119,17 @@ def test_bad_options_are_one_line(
     assert wanted in error
 
 
+@pytest.mark.parametrize(("rate", "wanted"), [([], "no frame rate"), (["--fps", "30"], "no such weights")])
+def test_motions_are_read_as_they_were_simulated(
+    rate: list[str], wanted: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.zeros((9, 72)))
+    further = ["--start", str(tmp_path), "--rehearse", "5", "--motions", str(tmp_path), *rate]
+    assert main(["train", GARMENT, "--data", str(data), "--output", str(tmp_path / "w"), "--quiet", *further]) == 2
+    assert wanted in capsys.readouterr().err
+
+
 def test_a_folder_without_a_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", GARMENT, "--data", str(tmp_path), "--quiet"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
