@@ -14,7 +14,7 @@ from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transfor
 from refu_core.errors import GarmentError, require_type
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
 from refu_core.fitting._mesh_file import SurfaceMesh
-from refu_core.fitting._pieces import apart, outer_sides, unsewn, without_bodies, without_floor
+from refu_core.fitting._pieces import apart, outer_sides, slivers, unsewn, without_bodies, without_floor
 from refu_core.fitting._place import UNITS, Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
@@ -193,7 +193,7 @@ def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
         added = len(mesh.vertices) - n
         notes.append(f"edges longer than {1e3 * longest_edge:.0f} mm were split: {added} vertices were added to {n}")
     mesh, sides = outer_sides(mesh, posed)
-    notes += [*sides, *unsewn(mesh)]
+    notes += [*sides, *unsewn(mesh), *slivers(mesh)]
     mesh = _outward(mesh, posed)
     if place.pose.any():
         unposed = _unposed(mesh, posed)

@@ -15,7 +15,7 @@ from refu_core.fitting._mesh_file import SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._surround import sample
 from refu_core.frames import N_JOINTS
-from refu_core.mesh import face_normals, linked
+from refu_core.mesh import Connectivity, face_normals, linked
 
 F64 = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -43,6 +43,10 @@ _N_AROUND = 24
 _ALONG = 0.8
 """Least cosine between a face's normal and theirs, either way: faces of a hem have less. 0.7 to 0.9 found both sides of
 garments 1.5 to 12 mm thick, with jagged hems; with 0.5, a face of a hem joined the sides of most."""
+_SHORT = 0.1
+"""A mesh has slivers if a hundredth of its edges is shorter than this share of their median. In a T-shirt cut out of a
+grid it is 0.05, and none of 32 attempts to simulate it passed. With vertices nearer than 5 mm merged it is 0.4, and 3
+of 22 passed; in the T-shirts that ship it is 0.8."""
 _BETWEEN = 0.02
 """Parts farther than this from each other [m] along the body are two garments."""
 
@@ -168,6 +172,16 @@ def unsewn(mesh: SurfaceMesh) -> list[str]:
     sewn = "and aren't sewn" if n_along > 1 else "and isn't sewn to it"
     apart = 1e3 * float(np.median(gap[is_along[label] & (gap < _SEAM)]))
     return [f"{what}, {apart:.1f} mm apart, {sewn}: weld their seams, or simulated cloth comes apart there"]
+
+
+def slivers(mesh: SurfaceMesh) -> list[str]:
+    """A note of many very short edges, for a mesh in metres."""
+    a, b = mesh.vertices[Connectivity.of(mesh.faces, len(mesh.vertices)).edges].transpose(1, 0, 2)
+    short, median = np.percentile(1e3 * np.linalg.norm(a - b, axis=1), (1, 50))
+    if short > _SHORT * median:
+        return []
+    what = f"it has slivers: 1 % of its edges are shorter than {short:.1f} mm, half are longer than {median:.0f}"
+    return [f"{what}; simulated cloth may cross itself there: remesh it evenly before you simulate it"]
 
 
 def _gaps(points: F64, label: Ints) -> F64:

@@ -26,7 +26,7 @@ from refu_core.fitting import (
     standing_pose,
 )
 from refu_core.fitting._clean import clean, components, split_long_edges
-from refu_core.fitting._pieces import unsewn, without_bodies
+from refu_core.fitting._pieces import slivers, unsewn, without_bodies
 from refu_core.fitting._place import find_places
 from refu_core.garments import UvMap, save_garment
 from refu_core.mesh import Connectivity, vertex_normals
@@ -314,6 +314,12 @@ def test_panels_that_nobody_sewed_are_said(gap: float, is_said: bool) -> None:
     notes = unsewn(clean(SurfaceMesh(v, f, None))[0])
     said = [note.partition(", and")[0] for note in notes]
     assert said == (["2 pieces lie along each other, 2.0 mm apart"] if is_said else [])
+
+
+def test_slivers_are_said() -> None:
+    assert slivers(SurfaceMesh(*tube())) == []
+    (note,) = slivers(SurfaceMesh(*cloth(Wanted(step=0.014))))
+    assert note.startswith("it has slivers: 1 % of its edges are shorter than 0.5 mm, half are longer than 14")
 
 
 # -- the whole way
