@@ -14,7 +14,7 @@ from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transfor
 from refu_core.errors import GarmentError, require_type
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
 from refu_core.fitting._mesh_file import SurfaceMesh
-from refu_core.fitting._pieces import apart, outer_sides, slivers, unsewn, without_bodies, without_floor
+from refu_core.fitting._pieces import apart, outer_sides, slivers, unsewn, without_bodies, without_floor, without_specks
 from refu_core.fitting._place import UNITS, Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
@@ -114,8 +114,9 @@ def fit_garment(
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
         raise GarmentError(msg)
-    cleaned, floors = without_floor(cleaned)
-    notes += floors
+    for without in (without_floor, without_specks):
+        cleaned, left_out = without(cleaned)
+        notes += left_out
     _require_worn(cleaned)
     faults: list[GarmentError] = []
     makeshift: _Worn | None = None
