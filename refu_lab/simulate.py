@@ -51,8 +51,12 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
     if not card["counts"]["to_do"]:
         if card["counts"]["given_up"] == options.count:
             causes = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in card["yield"]["dropped"].items() if n)
-            msg = f"all {options.count} samples were given up, no attempt passed: {causes}; look at how the garment "
-            msg += "lies on the body (`refu garment add` makes pictures), or simulate more"
+            msg = (
+                f"all {options.count} samples were given up, no attempt passed: {causes}; look at how the garment lies "
+            )
+            msg += (
+                "on the body and what `refu garment add` says of its mesh (slivers, panels, pictures), or simulate more"
+            )
             raise SimulationError(msg)
         sheet = contact_sheet(GarmentDataset(options.output), body=options.body, garments=options.garments)
         save_png(sheet, options.output / SHEET)

@@ -17,7 +17,7 @@ from refu_core.errors import printable
 from refu_core.garments import worn_on
 from refu_core.options import check
 from refu_core.sdf import SDF_PRESETS
-from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
+from refu_core.simulation import GarmentDataset, GarmentSequences, load_clips, open_dataset
 from refu_core.training import (
     CarrySettings,
     DynamicsSettings,
@@ -68,13 +68,15 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
         return train_sdf(dataset, body, template, options.folder, settings=to_sdf, **common)
     common["body"] = body
     given = template, dataset, options.folder
+    motions = options.motions and load_clips(options.motions, axes=options.input_axes, fps=options.fps)
+    rehearsal = None if options.rehearse is None else Rehearsal(options.rehearse, motions)
     if options.network == "dynamics":
         moving = _seeded(DynamicsSettings(), options, **steps)
         return train_dynamics(*given, mode=options.mode, settings=moving, **common)
     if options.network == "lying":
-        known = Rehearsal(options.rehearse or 8000, options.motions)
+        assert rehearsal is not None  # `_check` has seen to it
         to_lie = _seeded(LyingSettings(), options, **steps)
-        return train_lying(*given, mode=options.mode, rehearsal=known, settings=to_lie, **common)
+        return train_lying(*given, mode=options.mode, rehearsal=rehearsal, settings=to_lie, **common)
     if options.like is not None:
         few = _seeded(CarrySettings(), options, **steps)
         return carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
@@ -83,7 +85,6 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
     first = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
     first = _seeded(first, options, **of_all)
     if options.start is not None:
-        rehearsal = None if options.rehearse is None else Rehearsal(options.rehearse, options.motions)
         common |= {"start": options.start, "mode": options.mode, "joints": _numbers(options.joints)}
         return pretrain(*given, settings=first, rehearsal=rehearsal, **common)
     if options.mode == "none":
@@ -114,6 +115,9 @@ def _check(options: TrainOptions) -> None:
         "--start goes on with networks as they are: leave --scale, --margin, --unblended, --network and --preset out": (
             options.start is not None and is_changed
         ),
+        "what lying people's cloth does is learnt beside what others' does: give --rehearse N, 8000 for instance": (
+            options.network == "lying" and options.rehearse is None
+        ),
         f"no preset {options.preset!r} of training: wanted {', '.join(presets)}": options.preset not in presets,
     }
     for msg, is_so in refused.items():
@@ -135,10 +139,13 @@ def _seeded(settings: Any, options: TrainOptions, **changes: Any) -> Any:
 
 def training_table(card: dict[str, Any], options: TrainOptions) -> str:
     """What `refu train` prints."""
-    rows = [(name, str(card[name])) for name in ("backbone", "mode", "preset", "like", "samples") if name in card]
-    rows += [
-        (name.replace("_", " "), f"{value:.3f}")
-        for name, value in card.get("figures", {}).items()
-        if isinstance(value, (int, float))
-    ]
+    named = [name for name in ("backbone", "mode", "preset", "like") if name in card]
+    rows: list[tuple[str, str]] = [(name, str(card[name])) for name in named]
+    # Mirrored ones count, too, where they were learnt from.
+    rows += [("training samples", str(card["samples"]))] if "samples" in card else []
+    for name, value in card.get("figures", {}).items():
+        if isinstance(value, int):
+            rows.append((f"test {name}", str(value)))
+        elif isinstance(value, float):
+            rows.append((name.replace("_", " "), f"{value:.3f}"))
     return format_table((options.garment, str(options.folder)), rows)

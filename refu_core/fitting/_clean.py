@@ -37,9 +37,9 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
         mesh = replace(mesh, uv=None)
     mesh = _without_double_faces(_without_strays(mesh, notes), notes)
     mesh = _welded(mesh, notes)
-    partner, n_crowded = _partners(mesh)
+    partner, n_crowded = partners(mesh)
     mesh = turned_over(mesh, _oriented(mesh.faces, partner, notes))
-    partner, _ = _partners(mesh)
+    partner, _ = partners(mesh)
     mesh = _cut_apart(mesh, partner)
     if n_crowded:
         notes.append(
@@ -173,7 +173,7 @@ def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     return mesh.compact(target[mesh.faces])
 
 
-def _partners(mesh: SurfaceMesh) -> tuple[Ints, int]:
+def partners(mesh: SurfaceMesh) -> tuple[Ints, int]:
     """Pairs of corners, 3 f + k for the edge from corner k of face f, across which faces continue; (P, 2).
 
     Also how many edges have more than two faces. Of these faces, the two that fold least stay together.

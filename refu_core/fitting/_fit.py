@@ -14,7 +14,7 @@ from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transfor
 from refu_core.errors import GarmentError, require_type
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
 from refu_core.fitting._mesh_file import SurfaceMesh
-from refu_core.fitting._pieces import apart, unsewn, without_bodies, without_floor
+from refu_core.fitting._pieces import apart, outer_sides, slivers, unsewn, without_bodies, without_floor, without_specks
 from refu_core.fitting._place import UNITS, Place, Placing, find_places
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer
@@ -114,8 +114,9 @@ def fit_garment(
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"
         raise GarmentError(msg)
-    cleaned, floors = without_floor(cleaned)
-    notes += floors
+    for without in (without_floor, without_specks):
+        cleaned, left_out = without(cleaned)
+        notes += left_out
     _require_worn(cleaned)
     faults: list[GarmentError] = []
     makeshift: _Worn | None = None
@@ -182,7 +183,7 @@ def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
     """The mesh on the body at some place; raises `GarmentError` where it can't be there."""
     posed = PosedBody(body, place.pose)
     mesh = replace(mesh, vertices=place(mesh.vertices))
-    notes, warnings = [*place.notes, *apart(mesh), *unsewn(mesh)], []
+    notes, warnings = [*place.notes, *apart(mesh)], []
     fit = place.fit
     if not (fit.is_good or fit.is_ring or fit.is_tight):
         where = f"{1e3 * fit.distance:.0f} mm off, {100 * fit.facing:.0f} % faces outward"
@@ -192,6 +193,8 @@ def _put_on(mesh: SurfaceMesh, place: Place, body: SmplBody, longest_edge: float
     if len(mesh.vertices) > n:
         added = len(mesh.vertices) - n
         notes.append(f"edges longer than {1e3 * longest_edge:.0f} mm were split: {added} vertices were added to {n}")
+    mesh, sides = outer_sides(mesh, posed)
+    notes += [*sides, *unsewn(mesh), *slivers(mesh)]
     mesh = _outward(mesh, posed)
     if place.pose.any():
         unposed = _unposed(mesh, posed)

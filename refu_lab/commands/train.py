@@ -9,6 +9,7 @@ from typing import Any
 
 from refu_core.modes import DEFAULT_MARGIN, MAX_MARGIN
 from refu_core.options import setting
+from refu_core.recordings import Axes
 from refu_lab.commands import _common as cli
 
 TRAIN_MODES = ("none", "hybrid", "approx", "accurate", "collision-approx", "collision-accurate")
@@ -75,6 +76,8 @@ class TrainOptions:
         metavar="N",
     )
     motions: Path | None = setting(None, "the motions of those plans", parse=cli.in_path, metavar="DIR")
+    input_axes: Axes = cli.axes_of("motions'", "z up, as ROS has it")
+    fps: float | None = cli.rate_of_files()
     seed: int = cli.seeded()
     steps: int | None = setting(None, "steps of each stage (default: the preset's)", parse=cli.positive, metavar="N")
     device: str = setting("cpu", "cpu or cuda")
@@ -104,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
     needed = {} if args.network == "lying" else {"motions": "rehearse", "rehearse": "start"}
-    cli.require_use(args, {**needed, "joints": "start"})
+    cli.require_use(args, {"fps": "motions", **needed, "joints": "start"})
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
     return cli.tell(args, training_table(card, options), card)

@@ -26,7 +26,7 @@ from refu_core.fitting import (
     standing_pose,
 )
 from refu_core.fitting._clean import clean, components, split_long_edges
-from refu_core.fitting._pieces import unsewn
+from refu_core.fitting._pieces import slivers, unsewn, without_bodies
 from refu_core.fitting._place import find_places
 from refu_core.garments import UvMap, save_garment
 from refu_core.mesh import Connectivity, vertex_normals
@@ -299,6 +299,9 @@ def test_a_character_s_body_is_left_out_of_its_clothes_and_is_no_garment() -> No
     assert len(fitted.template.uv.faces) == len(shirt.faces)
     with pytest.raises(GarmentError, match="it is a body with head, hands and feet"):
         fit_garment(SurfaceMesh(parts[1][0].astype(np.float64), parts[1][1], None), wearer, name="body", placing=AS_IS)
+    skin, faces = wearer.v_template.double().numpy(), wearer.faces.numpy()
+    overall = SurfaceMesh(1.01 * skin, faces[skin[faces][:, :, 1].max(1) < 0.36]).compact()  # its collar is at the chin
+    assert without_bodies(overall, overall.vertices, PosedBody(wearer, np.zeros((24, 3))))[1] == []
 
 
 @pytest.mark.parametrize(("gap", "is_said"), [(0.0, False), (0.002, True), (0.03, False)])
@@ -311,6 +314,12 @@ def test_panels_that_nobody_sewed_are_said(gap: float, is_said: bool) -> None:
     notes = unsewn(clean(SurfaceMesh(v, f, None))[0])
     said = [note.partition(", and")[0] for note in notes]
     assert said == (["2 pieces lie along each other, 2.0 mm apart"] if is_said else [])
+
+
+def test_slivers_are_said() -> None:
+    assert slivers(SurfaceMesh(*tube())) == []
+    (note,) = slivers(SurfaceMesh(*cloth(Wanted(step=0.014))))
+    assert note.startswith("it has slivers: 1 % of its edges are shorter than 0.5 mm, half are longer than 14")
 
 
 # -- the whole way

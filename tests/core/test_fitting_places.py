@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,11 @@ from scipy.spatial.transform import Rotation
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.fitting import Placing, SurfaceMesh, _fit, fit_garment, standing_pose
-from refu_core.fitting._clean import no_opening
-from refu_core.fitting._pieces import without_floor
+from refu_core.fitting._clean import components, no_opening
+from refu_core.fitting._pieces import without_floor, without_specks
 from refu_core.fitting._place import Place, find_places
 from refu_core.fitting._surround import parts_legs
+from refu_core.mesh import rim_of, vertex_normals
 
 SHIRT = Wanted(low=0.66, sleeve=0.6, step=0.028)
 F64 = NDArray[np.float64]
@@ -251,3 +253,34 @@ def test_a_floor_is_left_out() -> None:
     assert notes == ["a flat piece, wider than all the rest, was taken for a floor and left out"]
     for part in (parts[:1], [(v, f), button(np.array([0, 1.2, 0.15]))]):
         assert without_floor(SurfaceMesh(*together(part)))[1] == []
+
+
+def test_specks_of_a_scan_are_left_out_and_buttons_are_not() -> None:
+    parts = [cloth(replace(SHIRT, step=0.05)), button(np.array([0.03, 1.1, 0.17])), button(np.array([0.4, 0.9, 0.3]))]
+    kept, notes = without_specks(SurfaceMesh(*together(parts)))
+    assert notes == ["1 tiny pieces that float far from all the rest, as a scan's specks do, were left out"]
+    np.testing.assert_array_equal(kept.vertices, together(parts[:2])[0])
+    assert without_specks(kept)[1] == []
+
+
+@pytest.mark.parametrize("n_panels", [1, 2])
+def test_cloth_with_two_sides_is_worn_with_its_outer_one(n_panels: int) -> None:
+    """Trousers 3 mm thick, closed along their hems, in one piece or in panels that touch; a button on them is whole."""
+    v, f = cloth(Wanted(low=0.13, high=0.99, legs=True, step=0.03))
+    ball, thick = button(np.array([0.0, 0.93, float(v[np.abs(v[:, 1] - 0.93) < 0.03, 2].max()) + 0.004])), []
+    for k in range(n_panels):
+        used, own = np.unique(f[(v[f].mean(1)[:, 2] > 0.03) % n_panels == k], return_inverse=True)
+        own = own.reshape(-1, 3)
+        on_rim = rim_of(own)
+        a, b = own[on_rim], np.roll(own, -1, axis=1)[on_rim]
+        n = len(used)
+        walls = np.concatenate((np.stack((b, a, a + n), 1), np.stack((b, a + n, b + n), 1)))
+        inner = (v - 0.003 * vertex_normals(v, f))[used]
+        thick.append((np.concatenate((v[used], inner)), np.concatenate((own, own[:, ::-1] + n, walls))))
+    made = fit_garment(SurfaceMesh(*together([*thick, ball])), load_body("male"), name="jeans")
+    pieces = f"{n_panels} of {n_panels + 1} pieces"
+    assert f"cloth with two sides, of which the outer one is worn ({pieces})" in made.notes
+    plain = fit_garment(SurfaceMesh(*together([(v, f), ball])), load_body("male"), name="plain").template
+    assert made.template.faces.shape == plain.faces.shape
+    assert components(made.template.faces.numpy(), made.template.n_vertices)[0] == 2
+    assert float((made.template.v_template - plain.v_template).norm(dim=1).median()) < 1e-3

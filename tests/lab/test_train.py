@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,7 @@ def test_the_figures_are_printed(weights: Path, data: Path, capsys: pytest.Captu
     out = capsys.readouterr().out
     assert "mpve mm" in out
     assert "backbone" in out
+    assert all(re.search(rf"{split} samples +\d+\n", out) for split in ("training", "test"))
 
 
 def test_variants(data: Path, weights: Path) -> None:
@@ -115,6 +117,17 @@ def test_bad_options_are_one_line(
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert wanted in error
+
+
+@pytest.mark.parametrize(("rate", "wanted"), [([], "no frame rate"), (["--fps", "30"], "no such weights")])
+def test_motions_are_read_as_they_were_simulated(
+    rate: list[str], wanted: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.zeros((9, 72)))
+    further = ["--start", str(tmp_path), "--rehearse", "5", "--motions", str(tmp_path), *rate]
+    assert main(["train", GARMENT, "--data", str(data), "--output", str(tmp_path / "w"), "--quiet", *further]) == 2
+    assert wanted in capsys.readouterr().err
 
 
 def test_a_folder_without_a_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
