@@ -217,11 +217,11 @@ def save_lying(folder: Path, lying: Lying, card: Mapping[str, Any]) -> Path:
 
 
 def with_lying(network: Backbone, weights: Weights) -> Backbone:
-    """A backbone made from `weights`, with what lying does to its garment, if that is beside them.
+    """A backbone made from `weights`, with what lying does to its garment, if that is beside those of a tailornet.
 
     Raises `WeightsError`: it is damaged, or made for another basis.
     """
-    if not weights.path.with_name("lying.json").exists():
+    if weights.card.get("backbone") != "tailornet" or not weights.path.with_name("lying.json").exists():
         return network
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
     stored = load_weights(weights.path.with_name("lying"), expect=expect)

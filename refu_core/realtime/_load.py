@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from os import PathLike
 
 import torch
@@ -13,7 +12,7 @@ from refu_core.backbones import Skinned, backbone_weights, with_dynamics, with_l
 from refu_core.body import ARMS, BodyFit, Collider, SmplBody, load_body, load_fit
 from refu_core.errors import BodyError, GarmentError, WeightsError, require_type
 from refu_core.garments import GarmentTemplate, load_garment, worn_on
-from refu_core.modes import DEFAULT_MARGIN
+from refu_core.modes import DEFAULT_MARGIN, BackboneName
 from refu_core.realtime._wearer import Outfit, Wearable
 from refu_core.refu import trained_from_weights
 from refu_core.weights import Weights, weights_folder
@@ -50,8 +49,7 @@ def load_outfit(
         if stored is None:
             wearables[name] = Wearable(worn_on(template, fit), Skinned(), None, DEFAULT_MARGIN)
         else:
-            worn = wearable_of(stored, template, fit, device=device)
-            wearables[name] = replace(worn, backbone=with_lying(with_dynamics(backbone, worn.backbone, stored), stored))
+            wearables[name] = wearable_of(stored, template, fit, backbone=backbone, device=device)
     return Outfit(wearer, wearables, Collider(wearer) if collider else None, fit)
 
 
@@ -81,9 +79,16 @@ def _cut_for(templates: Mapping[str, GarmentTemplate]) -> str:
 
 
 def wearable_of(
-    stored: Weights, template: GarmentTemplate, fit: BodyFit | None, *, device: str | torch.device = "cpu"
+    stored: Weights,
+    template: GarmentTemplate,
+    fit: BodyFit | None,
+    *,
+    backbone: str = BackboneName.TAILORNET,
+    device: str | torch.device = "cpu",
 ) -> Wearable:
     """A garment as it was cut, with the networks in `stored`, put on the body of `fit`, or on its own body if None.
+
+    The `backbone` decides whether dynamics beside them are used.
 
     Raises:
         WeightsError: the networks were trained on yet another body, or don't fit the garment.
@@ -106,6 +111,7 @@ def wearable_of(
             f"{hint}train some with `refu train {template.name} --body`"
         )
         raise WeightsError(msg)
+    network = with_lying(with_dynamics(backbone, network, stored), stored)
     margin = DEFAULT_MARGIN if refu is None else refu.margin
     feels_arms = all(joint in template.card.joints for arm in ARMS for joint in arm[:2])  # shoulders and elbows
     return Wearable(worn, network, refu, margin, betas, size, feels_arms and stored.card.get("knows_limbs") is True)
