@@ -65,6 +65,7 @@ class WithLying(nn.Module):
     def __init__(self, upright: Backbone, lying: Lying) -> None:
         super().__init__()
         self.upright, self.lying = upright, lying
+        self._is_serial = next(lying.parameters()).device.type == "cpu"
         self.heeds_past = upright.heeds_past
 
     @property
@@ -81,7 +82,7 @@ class WithLying(nn.Module):
         """Predicts as the backbone does, which is given what it is `told`, and adds what cloth of lying people does."""
         displacement = self.upright(betas, pose, style, **told)
         assert displacement is not None  # there are weights
-        if pose.device.type == "cpu" and not bool((lying_share(up_in_root(pose)) > 0).any()):
+        if self._is_serial and not bool((lying_share(up_in_root(pose)) > 0).any()):
             return displacement
         added: Tensor = self.lying.decoder(self.lying(self.lying.seen(betas, pose, style)))
         return displacement + added
