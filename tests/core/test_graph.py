@@ -182,6 +182,10 @@ def test_replayed_frames_are_those_of_the_pipeline(
     replaying._graphs = StepGraphs(as_on_a_gpu(replaying).packed, CPU, capture=capture)
     for seeds in ((0,), (1, 2), (3, 5), (4,), (0,)):
         given = frames(*seeds, style=seeds[0] == 4)
+        if seeds[0] == 4:  # who lies
+            pose = given[0].pose.copy()
+            pose[0] = (np.pi / 2, 0, 0)
+            given = [replace(given[0], pose=pose)]
         for new, old in zip(replaying(given), usual(given), strict=True):
             np.testing.assert_allclose(new.body, old.body, atol=1e-6)
             np.testing.assert_allclose(new.skin, old.skin, atol=1e-6)
