@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +25,16 @@ def lying_share(up: Tensor) -> Tensor:
     first, full = TILTS
     t = ((first - up[:, 1].abs()) / (first - full)).clamp(0, 1)
     return t * t * (3 - 2 * t)
+
+
+def is_lying(root: Sequence[float]) -> bool:
+    """Whether `lying_share` is above zero for somebody whose root is turned by this rotation vector [rad], shape (3,).
+
+    In Python: torch takes a hundred times as long for one person.
+    """
+    angle = math.hypot(*root)
+    share = (root[1] / angle) ** 2 if angle else 1.0
+    return abs(share + (1 - share) * math.cos(angle)) < TILTS[0]
 
 
 @dataclass(frozen=True)
@@ -82,7 +94,7 @@ class WithLying(nn.Module):
         """Predicts as the backbone does, which is given what it is `told`, and adds what cloth of lying people does."""
         displacement = self.upright(betas, pose, style, **told)
         assert displacement is not None  # there are weights
-        if self._is_serial and not bool((lying_share(up_in_root(pose)) > 0).any()):
+        if self._is_serial and not any(map(is_lying, pose[:, 0].tolist())):
             return displacement
         added: Tensor = self.lying.decoder(self.lying(self.lying.seen(betas, pose, style)))
         return displacement + added

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from small_set import write_set
 from torch import Tensor
@@ -25,6 +25,7 @@ from refu_core.backbones import (
     save_lying,
     up_in_root,
 )
+from refu_core.backbones._lying import is_lying
 from refu_core.errors import WeightsError
 from refu_core.simulation import SamplePlan
 from refu_core.training import LoopSettings, LyingSettings, PretrainSettings, Rehearsal, pretrain, train_lying
@@ -53,6 +54,15 @@ def test_it_is_faded_in_without_a_step(degrees: float) -> None:
     assert abs(here - there) < 0.06
     assert here == (0 if degrees <= 60 or degrees >= 120 else here)
     assert here == (1 if 76 < degrees < 104 else here)
+
+
+@given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
+def test_who_lies_is_whose_share_is_above_zero(root: list[float]) -> None:
+    pose = torch.zeros(1, 24, 3, dtype=torch.float64)
+    pose[0, 0] = torch.tensor(root)
+    tilt = float(up_in_root(pose)[0, 1].abs())
+    assume(abs(tilt - 0.5) > 1e-6)
+    assert is_lying(root) == bool(lying_share(up_in_root(pose)) > 0)
 
 
 @pytest.mark.parametrize("degrees", [0, 45, 59.9, 125, 180])
