@@ -224,7 +224,6 @@ def _grouped(owner: NDArray[Any], items: NDArray[Any], n: int) -> Adjacency:
     return Adjacency(start.astype(np.int32), items[order].astype(np.int32))
 
 
-@remembered(16)
 def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int64]:
     """An order of places (N, 3) in which every eight (or `width`) in a row, every 64, and so on are close together."""
     n = len(places)
@@ -246,3 +245,7 @@ def grouped(places: NDArray[np.floating[Any]], width: int = 8) -> NDArray[np.int
         half = np.maximum(-(-sizes[is_open] // unit) // 2, 1) * unit
         bounds = np.union1d(bounds, starts[is_open] + half)
     return order
+
+
+grouped_at_rest = remembered(16)(grouped)
+"""`grouped`, for places that every pipeline asks about again."""

@@ -33,7 +33,8 @@ SEEN_TILT = (np.radians(40), np.radians(60))
 """No recorded motion of the training tilts the pelvis beyond the first of these [rad]; lying postures do, but networks
 are told of no tilt beyond the second.
 On a lying person, a skirt was off by 30 to 46 mm and a T-shirt by 15 to 23; with this, by 32 to 44 and 12 to 18."""
-_MOST_TILT = 0.5  # the cosine of the second
+MOST_TILT = 0.5
+"""The cosine of the second."""
 
 
 def told_up(up: Tensor) -> Tensor:
@@ -42,10 +43,10 @@ def told_up(up: Tensor) -> Tensor:
     Beyond 120° the tilt falls again: a handstand is told as upright; otherwise a slight change could turn it over.
     """
     x, y, z = up.unbind(-1)
-    sine2 = 1 - _MOST_TILT**2
+    sine2 = 1 - MOST_TILT**2
     level = (sine2 / (x * x + z * z).clamp_min(sine2)).sqrt()
     return torch.where(
-        y[:, None] >= _MOST_TILT, up, torch.stack((x * level, y.abs().clamp_min(_MOST_TILT), z * level), -1)
+        y[:, None] >= MOST_TILT, up, torch.stack((x * level, y.abs().clamp_min(MOST_TILT), z * level), -1)
     )
 
 

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from refu_core.backbones._decoder import BasisDecoder
-from refu_core.backbones._features import N_STYLE_SHAPE, PoseFeatures, style_shape, up_in_root
+from refu_core.backbones._features import MOST_TILT, N_STYLE_SHAPE, PoseFeatures, style_shape, up_in_root
 from refu_core.backbones._perceptron import Perceptron
 from refu_core.backbones._protocol import Backbone
 
-TILTS = (0.5, 0.25)
+TILTS = (MOST_TILT, 0.25)
 """Cosines of the tilts of the pelvis between which a lying person's cloth is faded in: 60°, the most that other
 networks are told of (`told_up`), and 76°."""
 

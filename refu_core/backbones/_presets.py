@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import Module
 
 from refu_core._files import read_json
 from refu_core._warp import memory
@@ -118,10 +119,7 @@ def save_backbone(
 
     Raises `WeightsError` for weights that aren't finite or can't be written, and for another basis in the folder.
     """
-    parameters = dict(backbone.named_parameters())
-    state = {k: v for k, v in backbone.state_dict().items() if not k.startswith("decoder.")}
-    # Buffers (pivots, standardisation) stay exact: the kernel of the mixture is narrow.
-    tensors = {_PREFIX + k: v.half() if half and k in parameters else v for k, v in state.items()}
+    tensors = {_PREFIX + k: v for k, v in _own_tensors(backbone, half=half).items()}
     name = next(name for name, kind in _CONFIGS.items() if isinstance(backbone.config, kind))
     described: dict[str, Any] = {"backbone": name, "config": asdict(backbone.config)}
     if not isinstance(backbone, Gcnn) and isinstance(backbone.decoder, BasisDecoder):
@@ -169,11 +167,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
 
 def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> Path:
     """Writes a garment's dynamics, `folder`/dynamics. Raises `WeightsError` also if there is no basis."""
-    basis = load_weights(folder / "basis", expect={"garment": card["garment"]})
-    described = {"config": asdict(dynamics.config), "basis_sha256": str(basis.card["sha256"])}
-    parameters = dict(dynamics.named_parameters())
-    tensors = {k: v.half() if k in parameters else v for k, v in dynamics.state_dict().items()}
-    return save_weights(folder / "dynamics", tensors, {**described, **card})
+    return _save_addition(folder / "dynamics", dynamics, dynamics.config, card, {})
 
 
 def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
@@ -207,13 +201,29 @@ _BASIS = "basis."
 
 def save_lying(folder: Path, lying: Lying, card: Mapping[str, Any]) -> Path:
     """Writes what lying does to a garment, `folder`/lying. Raises `WeightsError` also if there is no basis."""
-    basis = load_weights(folder / "basis", expect={"garment": card["garment"]})
-    described = {"config": asdict(lying.config), "basis_sha256": str(basis.card["sha256"])}
-    parameters = dict(lying.named_parameters())
-    state = {k: v for k, v in lying.state_dict().items() if not k.startswith("decoder.")}
-    tensors = {k: v.half() if k in parameters else v for k, v in state.items()}
-    tensors |= {_BASIS + k: v for k, v in lying.decoder.tensors().items()}
-    return save_weights(folder / "lying", tensors, {**described, **card})
+    basis = {_BASIS + k: v for k, v in lying.decoder.tensors().items()}
+    return _save_addition(folder / "lying", lying, lying.config, card, basis)
+
+
+def _save_addition(
+    stem: Path,
+    network: Module,
+    config: DynamicsConfig | LyingConfig,
+    card: Mapping[str, Any],
+    others: dict[str, Tensor],
+) -> Path:
+    """Writes what is added to a backbone, beside it; its card names the backbone's basis."""
+    basis = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
+    described = {"config": asdict(config), "basis_sha256": str(basis.card["sha256"])}
+    return save_weights(stem, _own_tensors(network, half=True) | dict(others), {**described, **card})
+
+
+def _own_tensors(network: Module, *, half: bool) -> dict[str, Tensor]:
+    """A network's tensors without its decoder's; `half` of the precision is enough for what was learnt."""
+    parameters = dict(network.named_parameters())
+    state = {k: v for k, v in network.state_dict().items() if not k.startswith("decoder.")}
+    # Buffers (pivots, standardisation) stay exact: the kernel of the mixture is narrow.
+    return {k: v.half() if half and k in parameters else v for k, v in state.items()}
 
 
 def with_lying(network: Backbone, weights: Weights) -> Backbone:
@@ -234,7 +244,7 @@ def with_lying(network: Backbone, weights: Weights) -> Backbone:
         lying = build_for(tensors, lambda: Lying(config, decoder), shared="decoder.")
     except WeightsError as error:
         raise WeightsError(f"{stored.path}: {error}") from error
-    device = next(network.parameters()).device if isinstance(network, torch.nn.Module) else "cpu"
+    device = next(network.parameters()).device if isinstance(network, Module) else "cpu"
     return WithLying(network, lying.float().to(device)).eval().requires_grad_(False)
 
 

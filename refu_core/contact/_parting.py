@@ -12,7 +12,7 @@ from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _parting_kernels as kernels
 from refu_core.contact._settings import ContactSettings
 from refu_core.contact._sheet import Sheet, cut_of
-from refu_core.mesh import Connectivity, grouped
+from refu_core.mesh import Connectivity, grouped_at_rest
 from refu_core.sdf._crossing_kernels import BLOCK
 
 
@@ -36,7 +36,7 @@ class Parting:
         self._ways = memory(2, n_faces, 3, device=rest.device)
         data = kernels.Outer()
         data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
-        data.order = ints(grouped(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)
+        data.order = ints(grouped_at_rest(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)
         data.cut, data.count = cut, as_warp(self._count, wp.int32)
         data.marked = as_warp(self._marked, wp.float32)
         data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))

@@ -17,7 +17,7 @@ from refu_core.body._bundles import bundled
 from refu_core.contact import _press_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import grouped
+from refu_core.mesh import grouped_at_rest
 
 _LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 """Joints of each limb; both legs are one, as a skirt lies on either."""
@@ -93,7 +93,7 @@ class Press:
         rest = garment.v_template.cpu().numpy()
         is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.limb_reach
         is_asked = is_loose | garment.mesh.independent
-        order, ring = grouped(rest), garment.mesh.ring
+        order, ring = grouped_at_rest(rest), garment.mesh.ring
         order = order[is_asked[order]]
         fabric = kernels.Fabric()
         fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)

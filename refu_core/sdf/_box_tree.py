@@ -11,7 +11,7 @@ from torch import Tensor
 
 from refu_core._warp import Repeated, as_warp, memory
 from refu_core.errors import MeshError
-from refu_core.mesh import grouped
+from refu_core.mesh import grouped_at_rest
 from refu_core.sdf._box_kernels import MAX_FACES, WIDTH, Boxes, Eight, fit_kernel
 
 _WIDTH = int(WIDTH)
@@ -35,7 +35,8 @@ class BoxTree:
             depth += 1
         n_above = sum(_WIDTH**level for level in range(depth))  # nodes whose children are nodes
         corners = rest.detach().cpu().numpy()[faces.numpy()]
-        self._order = torch.from_numpy(grouped(0.5 * (corners.min(1) + corners.max(1)), _WIDTH).astype(np.int32))
+        order = grouped_at_rest(0.5 * (corners.min(1) + corners.max(1)), _WIDTH)
+        self._order = torch.from_numpy(order.astype(np.int32))
         self._bounds = memory(n_above + -(-n // _WIDTH), 6, _WIDTH)
         self._bounds[:, :3], self._bounds[:, 3:] = torch.inf, -torch.inf
         self.boxes: Any = Boxes()
