@@ -56,8 +56,9 @@ _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 _NOTHING = 0.01
 """A mesh that fits has less than this share of it inside the body."""
 _N_REFINED = 2
-_OF_NO_UNIT = 1e-3
-"""An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit."""
+_NORMED = 1e-3
+"""An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit. A
+middle this near to the origin, as a share of the extent, was made so, too: the origin says nothing of the body."""
 
 
 @dataclass(frozen=True)
@@ -162,12 +163,12 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
     turns = turns_of(placing.up, mesh, is_placed=placing.is_placed)
-    found = search.by_convention(bodies, turns)
+    found = search.by_convention(bodies, turns) if search.has_origin else []
     if placing.is_whole and found and found[0].fit.is_near:
         yield _told(found[0])
         return
     found += search.of_other_heights(found, bodies)
-    if placing.pose is None and not any(one.fit.is_plain for one in found):
+    if placing.pose is None and found and not any(one.fit.is_plain for one in found):
         found += search.by_convention([PosedBody(body, standing_pose(*angles)) for angles in _RARER], turns)
         near = sorted((one for one in found if one.fit.is_near), key=lambda one: one.cost(extent))
         likely = [search.refined(one, moves=False, scales=False, bends=True) for one in near[:_N_REFINED]]
@@ -194,13 +195,13 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     for one in tiers:
         if one.fit.is_good and one.fit.inside < _NOTHING and one.fit.distance < NEAR and not one.is_sideways:
             yield _told(one)  # much of a glove faces other fingers
-    for tried in [None] if placing.unit else [None, [size / extent for size in _TRIED_SIZES]]:
-        if not placing.is_placed:
-            tiers += search.along(bodies, turns, tried or units, scales=tried is not None)
+    if not placing.is_placed and search.has_unit:
+        tiers += search.along(bodies, turns, units, scales=False)
+    if not placing.is_placed and not placing.unit:
+        tiers += search.along(bodies, turns, [size / extent for size in _TRIED_SIZES], scales=True)
     # A place by convention, or else one in a known unit, comes first unless it fits much worse.
-    has_unit = abs(np.log2(extent) - round(np.log2(extent))) > _OF_NO_UNIT
     least = min((one.cost(extent) for one in tiers if one.fit.is_good and search.knows(one)), default=math.inf)
-    if has_unit:
+    if search.has_unit:
         tiers = [one for one in tiers if search.knows(one) or _MISFIT * one.cost(extent) < least]
     handicap = [
         (k > 0) * _TOLERANCE + (not search.knows(one) or one.fit.inside > _NOTHING) * _UNIT_TOLERANCE
@@ -209,7 +210,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + handicap[k])
     order = [tiers[k] for k in ranked if tiers[k].fit.is_good]
     tight = [one for one in found if one.fit.is_tight and not one.fit.is_good and not one.is_sideways]
-    if tight and not good and has_unit:
+    if tight and not good and search.has_unit:
         # A sleeve without an arm in it costs less, but faces the wrong way.
         best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.fit.facing))
         # A mesh in metres that is close to the skin isn't meant to be a sixth larger, or to lie.
@@ -245,6 +246,13 @@ class _Search:
         self.samples = sample(mesh, _N_POINTS)
         under_arms = float(body.joint_template[[LEFT_SHOULDER, RIGHT_SHOULDER], 1].mean()) - _UNDER_ARMS
         self._highest = under_arms if placing.held_at == "waist" else math.inf
+        exponent = float(np.log2(self._extent))
+        self.has_unit = placing.unit is not None or abs(exponent - round(exponent)) > _NORMED
+        """Whether the mesh is in a unit, and wasn't scaled to a size of one."""
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        off = min(np.abs(middle).max() for middle in ((low + high) / 2, mesh.vertices.mean(0)))
+        self.has_origin = bool(placing.is_placed or off > _NORMED * self._extent)
+        """Whether its origin says where it belongs, and isn't its own middle."""
 
     def too_high(self, place: Place, body: PosedBody) -> bool:
         """Whether it reaches up between the arms, where it is held at the waist, or far above the head."""
@@ -270,7 +278,7 @@ class _Search:
         lifted = [
             _at(self.samples, one.unit, one.turn, one.shift + lift * np.eye(3)[1], here, one.kind, lift)
             for here, one in itertools.product(bodies, found)
-            if one.pose is here.pose and one.fit.is_near and not one.is_sideways and self.shows_height(one)
+            if one.pose is here.pose and one.fit.is_near and one.turn[0, 0] > 0.5 and self.shows_height(one)
             for lift in LIFTS
         ]
         return [one for one in lifted if one.fit.distance < NEAR and not self.too_high(one, bodies[0])]

@@ -193,12 +193,26 @@ def test_other_wearers_and_origins(name: str, scale: float, up: float, arms: flo
 
 
 def test_what_stands_far_off_is_not_lifted() -> None:
-    """Trousers with their origin in their middle were put a third of a metre up from the floor, below the hips."""
+    """Trousers with their origin near their middle were put a third of a metre up from the floor, below the hips."""
     garment = load_garment("trousers-neutral")
     v = garment.v_template.double().numpy()
     middle = (v.min(0) + v.max(0)) / 2
-    places = find_places(SurfaceMesh(v - middle, garment.faces.numpy()), load_body("neutral"), Placing())
+    places = find_places(SurfaceMesh(v - middle + 0.005, garment.faces.numpy()), load_body("neutral"), Placing())
     assert [place.lift for place in itertools.islice(places, 2)] == [0, 0]
+
+
+@pytest.mark.parametrize("size", [None, 1.0])
+def test_an_origin_in_the_middle_says_nothing_of_the_place(size: float | None) -> None:
+    """The T-shirt was worn back to front, 6 cm too high, as if its origin were the body's; or was 1 m long."""
+    garment = load_garment("tshirt-female")
+    body = load_body("female")
+    transforms = body(torch.as_tensor(standing_pose(0.5), dtype=torch.float32)[None]).transforms
+    v = apply_transforms(garment.v_template[None], blend_transforms(garment.weights, transforms))[0].double().numpy()
+    extent = np.ptp(v, axis=0).max()
+    v = (v - (v.min(0) + v.max(0)) / 2) * (1 if size is None else size / extent)
+    place = next(find_places(SurfaceMesh(v, garment.faces.numpy()), body, Placing()))
+    np.testing.assert_array_equal(place.turn, np.eye(3))
+    assert place.unit * np.ptp(v, axis=0).max() == pytest.approx(extent, rel=0.05)
 
 
 def test_what_is_said_is_not_overruled() -> None:
