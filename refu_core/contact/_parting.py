@@ -31,14 +31,14 @@ class Parting:
         self._is_serial = rest.device.type == "cpu"
         n, n_faces = len(rest), len(cut.faces)
         self._points = memory(n, 3, device=rest.device)
-        self._marked = memory(n, device=rest.device)
+        self._marked, self._far = memory(2, n, device=rest.device)
         self._count = memory(1, dtype=torch.int32, device=rest.device)
         self._ways = memory(2, n_faces, 3, device=rest.device)
         data = kernels.Outer()
         data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
         data.order = ints(grouped_at_rest(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)
         data.cut, data.count = cut, as_warp(self._count, wp.int32)
-        data.marked = as_warp(self._marked, wp.float32)
+        data.marked, data.far = as_warp(self._marked, wp.float32), as_warp(self._far, wp.float32)
         data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
         bounds = [settings.tolerance, settings.gap]
         each = int(BLOCK) if self._is_serial else 1
@@ -49,8 +49,13 @@ class Parting:
         }
         self._commands = {name: recorded(*launch, rest.device) for name, launch in launches.items()}
 
-    def find(self, above: Tensor) -> Tensor:
-        """How many pairs of faces of the outer garment, (V, 3) [m], and of the sheet cut each other, int32, (1,)."""
+    def find(self, above: Tensor, far: Tensor | None = None) -> Tensor:
+        """How many pairs of faces of the outer garment, (V, 3) [m], and of the sheet cut each other, int32, (1,).
+
+        `far` (V,) says how far from the sheet each vertex is at least [m], if that is known: it saves time.
+        """
+        if far is not None:
+            self._far.copy_(far)
         self._sheet.fit()
         with torch_stream(self._device):
             self._marked.zero_()
@@ -75,13 +80,15 @@ class Parting:
                 self._commands["part"].launch()
         return self._points.clone()
 
-    def parted(self, above: Tensor) -> Tensor:
+    def parted(self, above: Tensor, distance: Tensor) -> Tensor:
         """The outer garment, (V, 3) [m], moved off the sheet, by `parting_most` at most, if that leaves fewer cuts.
 
-        Where a hand is deep in a hip, the way out of one leads into the other, and nothing is done.
+        `distance` (V,) is how far from the sheet its vertices are at least [m]. Where a hand is deep in a hip, the way
+        out of one leads into the other, and nothing is done.
         """
-        n_before = self.find(above)
+        n_before = self.find(above, distance)
         if self._is_serial and not int(n_before):
             return above
-        parted = above + torch.renorm(self.part(above) - above, 2, 0, self._settings.parting_most)
-        return torch.where(self.find(parted) < n_before, parted, above)
+        way = torch.renorm(self.part(above) - above, 2, 0, self._settings.parting_most)
+        parted = above + way
+        return torch.where(self.find(parted, distance - way.norm(dim=1)) < n_before, parted, above)

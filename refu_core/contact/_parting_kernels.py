@@ -17,6 +17,8 @@ class Outer:
     cut: Cut
     order: wp.array[int]
     """Its faces, sorted so that those of each `BLOCK` are near each other."""
+    far: wp.array[float]
+    """How far from the sheet each vertex is at least [m]; 0 where that isn't known."""
     marked: wp.array[float]
     """1 for corners of faces that cut the sheet; later, for vertices that were moved last."""
     pulled: wp.array[int]
@@ -63,6 +65,18 @@ def cut_each_other(face: int, own: wp.mat33, other: wp.mat33, faces: wp.array2d[
     return edges > 0
 
 
+@wp.func
+def may_cut(face: int, own: wp.mat33, outer: Outer) -> bool:
+    """Whether a face is near enough to the sheet to cut it.
+
+    No place on a triangle is farther from the nearest corner than the longest edge, divided by the root of three.
+    """
+    faces = outer.cut.faces
+    far = wp.min(wp.min(outer.far[faces[face, 0]], outer.far[faces[face, 1]]), outer.far[faces[face, 2]])
+    longest = wp.max(wp.length_sq(own[0] - own[1]), wp.length_sq(own[1] - own[2]))
+    return far <= 0.0 or 3.0 * far * far <= wp.max(longest, wp.length_sq(own[2] - own[0]))
+
+
 @wp.kernel
 def find_kernel(each: int, below: Below, outer: Outer) -> None:
     """Marks the corners of faces that cut the sheet, and counts the pairs; `each` faces a thread, `BLOCK` at most."""
@@ -74,10 +88,12 @@ def find_kernel(each: int, below: Below, outer: Outer) -> None:
     highs = Corners()
     for n in range(first, end):
         own = corners(outer.order[n], outer.points, outer.cut.faces)
-        lows[n - first] = lowest(own)
-        highs[n - first] = highest(own)
-        lower = wp.min(lower, lowest(own))
-        upper = wp.max(upper, highest(own))
+        lows[n - first] = wp.vec3(wp.inf)
+        if may_cut(outer.order[n], own, outer):
+            lows[n - first] = lowest(own)
+            highs[n - first] = highest(own)
+            lower = wp.min(lower, lowest(own))
+            upper = wp.max(upper, highest(own))
     lower = wp.max(lower, below.extent[0])
     upper = wp.min(upper, below.extent[1])
     if lower[0] > upper[0] or lower[1] > upper[1] or lower[2] > upper[2]:

@@ -98,20 +98,17 @@ class ContactStage:
             for i, name in enumerate(self.order)
         }
 
-    def update(self, body: Tensor, n_held: Tensor | int = 0) -> None:
-        """Takes over the body's new pose, shape (V, 3) [m], and how many of its vertices have moved as far as they may.
+    def update(self, body: Tensor) -> None:
+        """Takes over the body's new pose, shape (V, 3) [m].
 
         Raises `MeshError` for a body that isn't finite.
         """
         self._body, self._skin_of = body, {}
-        # Where skin has given way as far as it may, cloth may lack room. A GPU isn't asked: there it is assumed.
-        self._is_tight = self._has_room and (not self._is_serial or bool(n_held > 0))
-        if self._is_tight:
-            self._skin.take(body)
         self.sdf.update(body)
         if self.way_out is not None:
             self.way_out.update(body)
         if self._has_room:
+            self._skin.take(body)
             self._limbs.update(body)
 
     def unfold(self, name: str, vertices: Tensor, rotation: Tensor) -> Tensor:
@@ -198,9 +195,10 @@ class ContactStage:
         if worn:
             done = self._part(name, done, margin=kept)
         vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
-        if self._is_tight:
-            vertices = self._off_skin[name].parted(vertices)
-        if was_drawn or was_torn or worn or self._is_tight:  # No single step goes farther than this; together they may.
+        if self._has_room:
+            vertices = self._off_skin[name].parted(vertices, done.distance)
+        # No single step goes farther than this; together they may.
+        if was_drawn or was_torn or worn or vertices is not done.vertices:
             vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
         if self.way_out is not None:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)

@@ -24,7 +24,6 @@ from refu_core.realtime._wearer import Outfit, Wearer
 Adjust = Callable[[Dressed], Dressed]
 """Changes what was predicted: garments, not bodies."""
 N_SHIFT = 4
-_N_HELD = 3
 
 
 class Person(NamedTuple):
@@ -108,7 +107,7 @@ class FrameStep:
             clock = clocks[person] if clocks else StageClock()
             clock.start(shared, share=1 / len(pose))
             if self.contact is not None:
-                self.contact.update(body, shifts[person, _N_HELD])
+                self.contact.update(body)
             clock.lap("sdf")
             garments: dict[str, Worn] = {}
             for name in self._order:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from test_layers import sheet, wavy
 from torch import Tensor
 
+from refu_core.body import Surface
 from refu_core.contact import DEFAULT_CONTACT, Layer, Parting, Sheet
 from refu_core.contact._parting_kernels import depth_below
 from refu_core.mesh import Connectivity
@@ -143,8 +144,28 @@ def test_cloth_that_runs_through_a_body_between_its_vertices_is_parted_if_that_l
     before = checker.check(above.numpy(), faces.numpy())
     assert before.n_pairs > 0
     assert also_deep or not before.inside.any()
-    found = Parting(Connectivity.of(faces), above, skin, settings=DEFAULT_CONTACT).parted(above)
+    parting = Parting(Connectivity.of(faces), above, skin, settings=DEFAULT_CONTACT)
+    surface = Surface(vertices, body_faces)
+    distance = np.linalg.norm(surface.at(surface.closest(above.double().numpy())) - above.numpy(), axis=1)
+    found = parting.parted(above, torch.from_numpy(distance).float())
     after = checker.check(found.numpy(), faces.numpy())
     assert after.n_pairs < before.n_pairs if not also_deep else after.n_pairs <= before.n_pairs
     assert also_deep or after.is_free
     assert (found - above).norm(dim=1).max() <= DEFAULT_CONTACT.parting_most + 1e-6
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_faces_that_are_left_out_since_they_are_too_far_off_cut_nothing(seed: int) -> None:
+    """A sheet of long triangles over a spiky ball whose tips poke through them, far from any of their corners."""
+    rng = np.random.default_rng(seed)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
+    vertices = ball.vertices * rng.uniform(0.8, 1.2, (len(ball.vertices), 1))
+    above, faces = sheet(7, step=0.02, height=0.028)
+    above += torch.from_numpy(rng.normal([-0.06, 0, -0.06], 0.004, above.shape)).float()
+    skin = Sheet(Connectivity.of(ball.faces), torch.zeros(len(vertices), 3))
+    skin.take(torch.from_numpy(vertices).float())
+    parting = Parting(Connectivity.of(faces), above, skin, settings=DEFAULT_CONTACT)
+    surface = Surface(vertices, ball.faces)
+    distance = np.linalg.norm(surface.at(surface.closest(above.double().numpy())) - above.numpy(), axis=1)
+    assert int(parting.find(above, torch.from_numpy(distance).float())) == int(parting.find(above, torch.zeros(49)))

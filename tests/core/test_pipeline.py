@@ -27,8 +27,10 @@ from refu_core import (
     load_garment,
 )
 from refu_core.errors import MeshError
+from refu_core.metrics import CollisionChecker
 from refu_core.realtime import SkinShift, within_promise
 from refu_core.sdf import ExactSdf, Winding
+from refu_core.simulation import posture
 
 
 def frame(seed: int = 0, *, spread: float = 0.25, transl: tuple[float, float, float] = (0, 0, 0)) -> SmplFrame:
@@ -116,6 +118,18 @@ def test_garments_are_brought_off_the_collider(sdf: str) -> None:
         found = inside(torch.tensor(apart["tshirt-male"].local)).count_nonzero()
         assert apart.stats.garments["tshirt-male"].n_unresolved == found, "certified by the collider"
         assert found == 0
+
+
+@pytest.mark.parametrize("sdf", ["hybrid", "accurate"])
+@pytest.mark.parametrize("garment", ["short-pant-male", "trousers-male", "trousers-female"])
+def test_who_sits_has_no_skin_between_the_vertices_of_trousers(garment: str, sdf: str) -> None:
+    """Where thighs are bent a fold of skin sticks out, narrower than the cloth's triangles."""
+    pipeline = GarmentPipeline.load([garment], sdf=sdf)
+    checker = CollisionChecker(pipeline.body.faces)
+    out = pipeline(SmplFrame(pose=posture("sitting")))
+    assert out.stats.within_promise
+    checker.update(out.body)
+    assert checker.check(out[garment].local, out[garment].faces).is_free
 
 
 def test_nobody_can_write_in_what_others_get(pipeline: GarmentPipeline) -> None:
