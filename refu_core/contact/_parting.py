@@ -52,7 +52,8 @@ class Parting:
     def find(self, above: Tensor, far: Tensor | None = None) -> Tensor:
         """How many pairs of faces of the outer garment, (V, 3) [m], and of the sheet cut each other, int32, (1,).
 
-        `far` (V,) says how far from the sheet each vertex is at least [m], if that is known: it saves time.
+        `far` (V,) says how far from the sheet each vertex is at least [m], if that is known: faces too far off to cut
+        it are skipped.
         """
         if far is not None:
             self._far.copy_(far)
@@ -83,8 +84,9 @@ class Parting:
     def parted(self, above: Tensor, distance: Tensor) -> Tensor:
         """The outer garment, (V, 3) [m], moved off the sheet, by `parting_most` at most, if that leaves fewer cuts.
 
-        `distance` (V,) is how far from the sheet its vertices are at least [m]. Where a hand is deep in a hip, the way
-        out of one leads into the other, and nothing is done.
+        `distance` (V,) is how far from the sheet its vertices are at least [m]. An approximate one may be too long and
+        hide a cut, but hid none in 444 frames. Where a hand is deep in a hip, the way out of one leads into the other,
+        and nothing is done.
         """
         n_before = self.find(above, distance)
         if self._is_serial and not int(n_before):
