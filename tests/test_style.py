@@ -167,7 +167,7 @@ import importlib, os, sys
 
 for package, *forbidden in map(str.split, sys.argv[1:]):
     if "torch" not in forbidden:
-        import torch, warp  # once for all that may: it takes seconds
+        import refu_core.realtime  # once for all: it takes seconds, and may load nothing that they mustn't
     if os.fork() == 0:
         importlib.import_module(package)
         print(package, *sys.modules, flush=True)
