@@ -14,6 +14,7 @@ import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is imported; the programs say so themselves
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # of some hundred processes each would compile all modules again
+sys.dont_write_bytecode = False  # pytest, too, would rewrite all tests again in each of its processes
 
 _MISSING = [name for name in ("torch", "warp", "hypothesis", "rosbags") if not importlib.util.find_spec(name)]
 

@@ -104,10 +104,11 @@ class PoseFeatures(nn.Module):
 
     def columns_of(self, joints: tuple[int, ...]) -> Tensor:
         """Which of the features belong to these joints and to up. Raises `ValueError` for a joint that it lacks."""
-        if self.encoding != "matrix":
-            return torch.arange(self.size)
-        first = [3 + 9 * self.joints.index(joint) for joint in joints if joint != 0]
-        return torch.cat([torch.arange(3), *(torch.arange(at, at + 9) for at in first)])
+        columns = np.arange(self.size)  # in NumPy, as above
+        if self.encoding == "matrix":
+            first = [3 + 9 * self.joints.index(joint) for joint in joints if joint != 0]
+            columns = np.concatenate([columns[:3], *(columns[at : at + 9] for at in first)])
+        return torch.from_numpy(columns)
 
     def are_bounded(self, garment: GarmentTemplate) -> Tensor:
         """Which numbers of (features, β, γ) a garment's network should see only within their known range, (size + 14,).

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from refu_core._cache import remembered
-from refu_core._warp import as_warp, memory
+from refu_core._warp import as_warp, ints, memory
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
 from refu_core.body._aside import Aside
@@ -99,7 +99,8 @@ class Anatomy:
         self.bones = self._bind_bones(rest, mesh, weights)
         self.seams = self._bind_seams(body)
         self.segments = self._bind_segments(rest, solids, weights)
-        self.farthest = self._thickness(rest, mesh).mul(settings.thin).clamp(max=settings.farthest)
+        thickness = _thickness(rest, mesh, str(self.device))
+        self.farthest = torch.as_tensor(thickness, device=self.device).mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
         self.aside = Aside(body, mesh, farthest=settings.aside_farthest, rounds=settings.aside_rounds)
         """Brings arms out of the rest of the body."""
@@ -154,17 +155,6 @@ class Anatomy:
         self.stations.weight = self._floats(found.station_weight)
         self.stations.mean = wp.zeros(len(found.station_start) - 1, dtype=wp.vec3, device=str(self.device))
         return seams
-
-    def _thickness(self, rest: NDArray[np.float64], mesh: Connectivity) -> torch.Tensor:
-        """Distance to the skin on the other side [m], the least over each vertex and its neighbours, shape (V,)."""
-        device, points = str(self.device), self._vectors(rest)
-        body = wp.Mesh(points, self._ints(mesh.faces.ravel()))
-        across = wp.zeros(len(rest), dtype=wp.float32, device=device)
-        wp.launch(parting.thickness_kernel, len(rest), [body.id, points, self.bones.normal, across], device=device)
-        found = across.numpy()
-        least = found.copy()
-        np.minimum.at(least, mesh.ring.owner, found[mesh.ring.items])
-        return torch.as_tensor(least, device=self.device)
 
     def _bind_segments(self, rest: NDArray[np.float64], solids: Solids, weights: NDArray[np.float64]) -> Any:
         how, n, device = self.settings, len(rest), str(self.device)
@@ -251,8 +241,8 @@ class Memory:
         self.work = work = kernels.Work()
         for name in ("skin", "points", "here", "there"):
             setattr(work, name, as_warp(getattr(self, name), wp.vec3))
-        for name, ints in zip(by_vertex, self.ints[:n_ints].view(len(by_vertex), -1), strict=True):
-            setattr(work, name, as_warp(ints, wp.int32))
+        for name, numbers in zip(by_vertex, self.ints[:n_ints].view(len(by_vertex), -1), strict=True):
+            setattr(work, name, as_warp(numbers, wp.int32))
         work.counts = as_warp(self.counts, wp.int32)
         for name in ("moved", "near", "boxed", "ends", "touching"):
             setattr(work, name, wp.zeros(n_vertices, dtype=wp.int32, device=str(device)))
@@ -290,3 +280,18 @@ def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArra
         normals = 0.5 * (normals + means / np.diff(ring.start)[:, None])
     unit: NDArray[np.float64] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return unit
+
+
+@remembered(4)
+def _thickness(rest: NDArray[np.float64], mesh: Connectivity, device: str) -> NDArray[np.float32]:
+    """Distance to the skin on the other side [m], the least over each vertex and its neighbours, shape (V,)."""
+    points, normals = (
+        wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (rest, _smooth_normals(rest, mesh))
+    )
+    body = wp.Mesh(points, ints(mesh.faces.ravel(), device))
+    across = wp.zeros(len(rest), dtype=wp.float32, device=device)
+    wp.launch(parting.thickness_kernel, len(rest), [body.id, points, normals, across], device=device)
+    found = across.numpy()
+    least: NDArray[np.float32] = found.copy()
+    np.minimum.at(least, mesh.ring.owner, found[mesh.ring.items])
+    return least

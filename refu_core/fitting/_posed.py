@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.body import JOINT_NAMES, SmplBody
-from refu_core.frames import N_JOINTS
+from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.mesh import vertex_areas
 from refu_core.sdf import ExactSdf
 
@@ -23,6 +23,7 @@ class PosedBody:
 
     def __init__(self, body: SmplBody, pose: F64) -> None:
         self.body = body
+        self._mean = body.shape(body.v_template.new_zeros(1, N_BETAS))
         self._sdf = ExactSdf(body.faces)
         self.skin = vertex_areas(body.arrays.v_template, body.arrays.faces)
         """Area of each vertex at rest [m²], shape (V,)."""
@@ -31,7 +32,7 @@ class PosedBody:
     def move(self, pose: F64) -> None:
         """Takes another pose."""
         self.pose = pose
-        posed = self.body(torch.as_tensor(pose, dtype=torch.float32)[None])
+        posed = self.body.posed(torch.as_tensor(pose, dtype=torch.float32)[None], self._mean)
         self.vertices, self.transforms = posed.vertices[0], posed.transforms
         self._sdf.update(self.vertices)
 

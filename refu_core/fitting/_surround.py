@@ -133,10 +133,9 @@ def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
     outward = (samples.normals * gradient).sum(1)
     # An open piece may face either way, but all of it should face the same way. A closed one has one side that faces
     # the body and one that faces away from it, and little that faces anything else.
-    votes = np.zeros((2, samples.piece.max() + 1))
-    np.add.at(votes[0], samples.piece[samples.is_open], outward[samples.is_open] > 0)
-    np.add.at(votes[1], samples.piece[samples.is_open], outward[samples.is_open] <= 0)
-    n_facing = votes.max(0).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
+    pieces, open_outward = samples.piece[samples.is_open], outward[samples.is_open]
+    votes, all_votes = (np.bincount(pieces, weights) for weights in (open_outward > 0, None))
+    n_facing = np.maximum(votes, all_votes - votes).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
     facing = float(n_facing / len(points))
     depth = np.clip(0.01 - distance, 0, 0.05)
     inside, off = float((distance < -0.01).mean()), float(np.clip(distance, 0, 0.6).mean())

@@ -11,9 +11,11 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from refu_core import load_body
 from refu_core.body import ARMS, Collider, ColliderSettings, RigidTransforms, SmplBody, rotvec_to_rotmat
+from refu_core.body._creases import _parting
 from refu_core.errors import MeshError
 from refu_core.metrics import SelfContactDetector
 from refu_core.realtime import Outfit
@@ -227,6 +229,24 @@ def _asked(collider: Collider, skin: torch.Tensor) -> tuple[torch.Tensor, torch.
     aside = collider.anatomy.aside
     aside(skin, torch.eye(3).expand(24, 3, 3))
     return torch.cat((skin, aside._means(skin)[aside._first_cap :])), aside.middles(skin)
+
+
+def test_a_seam_parts_the_means_of_the_skin_on_its_two_sides(body: SmplBody) -> None:
+    """Against the definition, place by place, to the bit; a place with skin of one side or none is left at zero."""
+    rng = np.random.default_rng(0)
+    rest = body.v_template.double().numpy()
+    places = rest[rng.integers(0, len(rest), 60)] + rng.normal(0, 0.02, (60, 3))
+    is_moved = rest @ rng.normal(size=3) > 0
+    wanted = np.zeros((60, 3))
+    tree = cKDTree(rest)
+    for i, near in enumerate(tree.query_ball_point(places, 0.03)):
+        weight = np.maximum(0.03 - np.linalg.norm(rest[near] - places[i], axis=1), 1e-9)
+        on = is_moved[near]
+        if on.any() and not on.all():
+            means = [np.average(rest[near][one], axis=0, weights=weight[one]) for one in (on, ~on)]
+            wanted[i] = (means[0] - means[1]) / np.linalg.norm(means[0] - means[1])
+    assert 0 < np.count_nonzero(wanted.any(1)) < 60
+    np.testing.assert_array_equal(_parting(places, rest, is_moved, tree), wanted)
 
 
 def test_arms_that_are_outside_stay(body: SmplBody, collider: Collider) -> None:
