@@ -15,7 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import pytest
+from fsspec.implementations.memory import MemoryFile
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,6 +28,7 @@ from refu_lab.cli import main
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import find_recordings, fleet_table, is_plain, open_engine
 from refu_lab.fleet._engine import DaskEngine, FleetError, run_function
+from refu_lab.fleet._storage import fetched
 from refu_lab.fleet._summary import FleetResult
 from refu_lab.fleet.replay import _CODE, _content
 from tests.lab import fleet_tasks
@@ -135,6 +138,22 @@ def test_no_two_recordings_have_one_name(tmp_path_factory: pytest.TempPathFactor
     assert len({recording.name for recording in found}) == len(paths)
     assert not any(recording.name.startswith(("/", "..")) for recording in found)
     assert not any(one.name.startswith(f"{other.name}/") for one in found for other in found)  # its report is a folder
+
+
+def test_no_result_leaves_its_folder(bags: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`refu replay walk.mcap ../b --output out` wrote out/../b/walk.mcap."""
+    monkeypatch.chdir(bags / "a")
+    assert names("walk.mcap", "../b", "../a/walk.mcap") == ["a/walk", "b/broken", "b/walk"]
+    store = fsspec.filesystem("memory")
+    for name in ("/fleet/bag/metadata.yaml", "/fleet/bag/../../../home/.bashrc", "/fleet/../../evil.mcap"):
+        store.store[name] = MemoryFile(store, name, b"x")
+    try:
+        with pytest.raises(RefuError, match=r"wanted a name without '\.\.', which leads out of a folder"):
+            names("memory://fleet/**")
+        with pytest.raises(RefuError, match="wanted names without"), fetched("memory://fleet/bag"):
+            pass
+    finally:
+        store.store.clear()
 
 
 # ---- what is done ----------------------------------------------------------------------------------------------------
