@@ -181,6 +181,13 @@ def test_what_there_is_to_warn_of_is_said_of_many_as_of_one() -> None:
     assert many.warnings()[-1] == "15 other warnings: --json names all"
 
 
+def test_names_of_files_are_no_commands_to_the_terminal() -> None:
+    rows = [
+        ROW | {"name": f"\x1b[2J{i}", "warnings": [f"odd {i}"], **more} for i, more in enumerate(({}, {"error": "x"}))
+    ]
+    assert fleet_table(FleetResult(rows)).replace("\n", "").isprintable()
+
+
 def test_a_bad_bag_is_reported_and_the_rest_is_done(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
     assert {path for path in content(alone) if path.endswith(".mcap")} == {"a/turn.mcap", "a/walk.mcap", "b/walk.mcap"}
     assert run(bags, "--output", alone, "--json", tmp_path / "all.json") == 2
