@@ -18,8 +18,10 @@ from refu_core.frames import PLAUSIBLE_TRANSL
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 HISTORY_NS = 10 * 10**9
 """How far back transforms are kept, as in tf2 [ns]."""
-_MOST_FRAMES = _MOST_STAMPS = 10_000
-"""The most frames in all, and the most stamps of one frame within the history: both are up to the sender."""
+_MOST_FRAMES, _MOST_STAMPS = 10_000, 1_000_000
+"""The most frames, and the most stamps of all frames together, 265 bytes each: both are up to the sender."""
+_MOST_OWN = 10_000
+"""The most stamps of one frame within the history; fewer where there are more than a hundred frames."""
 _LONGEST_NAME = 255
 """Of a frame [characters], as in the node's parameter: names of a megabyte each would fill the memory."""
 _LONGEST_WAY = 100
@@ -108,13 +110,13 @@ class _Track:
     values: list[NDArray[np.float64]] = field(default_factory=list)
     """Translation and quaternion, shape (7,) each."""
 
-    def put(self, stamp_ns: int, value: NDArray[np.float64]) -> None:
+    def put(self, stamp_ns: int, value: NDArray[np.float64], *, most: int) -> None:
         # A transform with an older stamp replaces all later ones: a simulation was reset, or a bag begins again.
         at = 0 if self.is_static else bisect_left(self.stamps, stamp_ns)
         del self.stamps[at:], self.values[at:]
         self.stamps.append(stamp_ns)
         self.values.append(value)
-        old = max(bisect_left(self.stamps, stamp_ns - HISTORY_NS), len(self.stamps) - _MOST_STAMPS)
+        old = max(bisect_left(self.stamps, stamp_ns - HISTORY_NS), len(self.stamps) - most)
         del self.stamps[:old], self.values[:old]
 
     def at(self, stamp_ns: int, tolerance_ns: int, child: str) -> Placement:
@@ -197,7 +199,7 @@ class TransformBuffer:
         track = self._tracks.get(child)
         if track is None or track.parent != parent or track.is_static != is_static:
             track = self._tracks[child] = _Track(parent, is_static)
-        track.put(one.stamp_ns, value)
+        track.put(one.stamp_ns, value, most=min(_MOST_OWN, _MOST_STAMPS // len(self)))
         self._heard.add(child)
         return ""
 

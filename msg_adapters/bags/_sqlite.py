@@ -1,12 +1,15 @@
 """rosbag2's other storage: an SQLite database with a table of topics and one of messages (`.db3`).
 
 A database can contain code: views, generated columns and triggers would run when it is read. So only plain columns of
-plain tables are read; anything else in their place is refused.
+plain tables are read; anything else in their place is refused. Its pages may also be shared: a few kilobytes can hold
+more rows than anybody can count, each as long as the file. So SQLite's steps are bounded by the file's size, too.
 """
 
 from __future__ import annotations
 
 import sqlite3
+import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -22,7 +25,11 @@ from refu_core.errors import printable
 MAGIC = b"SQLite format 3\x00"
 _NEEDED = {"topics": {"id", "name", "type", "serialization_format"}, "messages": {"topic_id", "timestamp", "data"}}
 _MAX_TOPICS = 1 << 16
-_ERRORS = (sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError)
+_LONGEST_SQL = 4000
+"""Of a statement, those that made the tables included [bytes]; rosbag2's have a few hundred."""
+_STEPS = 10_000
+"""Steps of SQLite's machine between two looks at how many are left; a row takes about ten."""
+_ERRORS = (OSError, sqlite3.Error, ValueError, TypeError, OverflowError, MemoryError)
 """What a damaged database may raise: its error message may not be UTF-8, numbers may be text, or too large."""
 
 
@@ -52,6 +59,11 @@ class SqliteFile:
         how = "mode=ro" if log.exists() else "mode=ro&immutable=1"
         try:
             with closing(sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?{how}", uri=True)) as database:
+                # `messages` may be paused for long between two steps, so it is steps that count, not seconds.
+                looks = iter(range(200 + 4 * self._path.stat().st_size // _STEPS))
+                database.set_progress_handler(lambda: next(looks, None) is None, _STEPS)
+                if sys.version_info >= (3, 11):
+                    database.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, _LONGEST_SQL)
                 database.execute("PRAGMA trusted_schema = OFF")
                 database.execute("PRAGMA cell_size_check = ON")
                 yield database
@@ -60,14 +72,16 @@ class SqliteFile:
 
     def topics(self, budget: Budget, *, by_reading: bool) -> tuple[list[tuple[TopicInfo, int]], bool]:  # noqa: ARG002
         """The topics with their message counts, and False: the counts always come from reading, not from a claim."""
-        counts = f"SELECT topic_id, count(*) FROM messages GROUP BY topic_id LIMIT {_MAX_TOPICS}"
+        topics: dict[int, TopicInfo] = {}
+        found: Counter[int] = Counter()
         try:
             with self._opened() as database:
-                found: dict[Any, int] = dict(database.execute(counts).fetchall())
-                return [(topic, found.get(n, 0)) for n, topic in self._topics(database, budget).items()], False
+                topics = self._topics(database, budget)
+                numbers = "SELECT topic_id FROM messages WHERE typeof(topic_id) = 'integer'"
+                found.update(number for (number,) in _rows(database, numbers, budget) if number in topics)
         except DamageError as damage:
             self.report(damage)
-            return [], False
+        return [(topic, found[number]) for number, topic in topics.items()], False
 
     def _topics(self, database: sqlite3.Connection, budget: Budget) -> dict[int, TopicInfo]:
         """The topics by number, without message counts."""
@@ -75,9 +89,9 @@ class SqliteFile:
         wanted += ["type_description_hash"] * ("type_description_hash" in self._columns["topics"])
         definitions = self._texts(database, budget)
         topics: dict[int, TopicInfo] = {}
-        for number, *values in database.execute(f"SELECT id, {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}"):
+        query = f"SELECT id, {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}"
+        for number, *values in _rows(database, query, budget, "bytes of declarations"):
             texts = [value if isinstance(value, str) else "" for value in values]
-            budget.spend("bytes of declarations", sum(map(len, texts)))
             got = dict(zip(wanted, texts, strict=True))
             kind = full_type_name(got["type"])
             topics[int(number)] = TopicInfo(
@@ -95,10 +109,9 @@ class SqliteFile:
         if not {"topic_type", "encoding", "encoded_message_definition"} <= self._definitions:
             return {}
         found = {}
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        for kind, encoding, text in database.execute(f"{query} LIMIT {_MAX_TOPICS}"):
+        query = f"SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT {_MAX_TOPICS}"
+        for kind, encoding, text in _rows(database, query, budget, "bytes of declarations"):
             if encoding == "ros2msg" and isinstance(kind, str) and isinstance(text, str):
-                budget.spend("bytes of declarations", len(text))
                 found[full_type_name(kind)] = text
         return found
 
@@ -107,10 +120,8 @@ class SqliteFile:
         try:
             with self._opened() as database:
                 topics = self._topics(database, budget)
-                for number, stamp_ns, data in database.execute(
-                    "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
-                ):
-                    budget.spend("records")
+                query = "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
+                for number, stamp_ns, data in _rows(database, query, budget):
                     if not (isinstance(number, int) and isinstance(stamp_ns, int) and isinstance(data, bytes)):
                         self.report(DamageError("a message that isn't a topic's number, a time and bytes"))
                     elif len(data) > MAX_CHUNK_BYTES:
@@ -119,10 +130,20 @@ class SqliteFile:
                     elif number not in topics:
                         self.report(DamageError("a message of the undeclared topic {}", number))
                     else:
-                        budget.spend("bytes unpacked", len(data))
                         yield topics[number], stamp_ns, stamp_ns, data
         except DamageError as damage:
             self.report(damage)
+
+
+def _rows(
+    database: sqlite3.Connection, query: str, budget: Budget, what: str = "bytes unpacked"
+) -> Iterator[tuple[Any, ...]]:
+    """The rows of a query, whose texts and bytes are spent as `what`."""
+    row: tuple[Any, ...]
+    for row in database.execute(query):
+        budget.spend("records")
+        budget.spend(what, sum(len(value) for value in row if isinstance(value, (str, bytes))))
+        yield row
 
 
 def _columns(database: sqlite3.Connection, table: str) -> set[str]:

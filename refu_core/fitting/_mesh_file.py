@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core._files import read_file
+from refu_core._files import parse_json, read_file
 from refu_core.errors import GarmentError
 from refu_core.garments import UvMap
 
 MESH_SUFFIXES: tuple[str, ...] = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 """Files that are read."""
-_PACKED = (b"KHR_draco_mesh_compression", b"EXT_meshopt_compression")
+_PACKED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
 """Extensions of glTF whose meshes aren't read."""
 _MAX_FILE_BYTES = 256 << 20
 _MAX_FACES = 400_000
 """A larger mesh is refused before anything is computed: no garment that is worn in real time is as fine."""
 _MAX_CORNERS = 1000
 """Of one polygon: the lid of a fine tube has hundreds."""
+_MAX_SQUARES = 10_000_000
+"""Of polygons' numbers of corners, which is what cutting their ears takes: ten lids of 1,000 corners."""
+_MAX_PARTS, _MAX_NODES = 600, 6000
+"""Of a file; trimesh takes up to 3 ms for each piece. A coat with its buttons has a hundred."""
+_MAX_VERTICES = 4_000_000
+"""Places and texture coordinates of a glTF's pieces, which often share them and are read with all of them."""
 _SIZES = (1e-6, 1e9)
 """Limits of a mesh's extent in its own unit: a garment may have 1e-4 in kilometres, 1e6 in micrometres."""
 
@@ -73,10 +81,6 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
         raise GarmentError(msg)
     content = read_file(source, most=_MAX_FILE_BYTES, error=GarmentError, wanted="a garment's mesh")
     try:
-        if suffix == ".gltf" and b'"uri"' in content and b'"data:' not in content:
-            raise ValueError("its numbers are in a file beside it; save it as one file, .glb")
-        if suffix.startswith(".gl") and b'"extensionsRequired"' in content and any(one in content for one in _PACKED):
-            raise ValueError("it is compressed (Draco or meshopt), which isn't read: export it without compression")
         with np.errstate(all="ignore"):  # numbers that aren't finite are refused below
             mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
         _require_few(len(mesh.faces))
@@ -90,6 +94,11 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
 def _require_few(n_triangles: int) -> None:
     if n_triangles > _MAX_FACES:
         raise ValueError(f"it has {n_triangles} triangles or more, at most {_MAX_FACES} are read: decimate it")
+
+
+def _require_few_parts(n_parts: int) -> None:
+    if n_parts > _MAX_PARTS:
+        raise ValueError(f"it has {n_parts} pieces, at most {_MAX_PARTS} are read: join them to one")
 
 
 def _check(mesh: SurfaceMesh) -> None:
@@ -156,6 +165,8 @@ def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     if len(sizes) and sizes.max() > _MAX_CORNERS:
         raise ValueError(f"a polygon of {sizes.max()} corners, at most {_MAX_CORNERS} are read: triangulate it")
+    if np.square(sizes[sizes > 4]).sum() > _MAX_SQUARES:
+        raise ValueError("it has too many polygons of many corners: triangulate it")
     known = np.array([max((corner[0] for corner in polygon), default=0) < len(points) for polygon in polygons], bool)
     # For each triangle, the number of its polygon, and its corners.
     found = [(np.flatnonzero(sizes == 3), np.array([p for p in polygons if len(p) == 3], np.int64).reshape(-1, 3, 2))]
@@ -220,6 +231,10 @@ def _holds(
 def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
     import trimesh
 
+    if suffix.startswith(".gl"):
+        content = _lean(content)
+    elif suffix == ".stl":
+        _require_few_parts(content.count(b"endsolid"))
     scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], process=False)
     parts = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     if not parts:
@@ -232,3 +247,52 @@ def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
     if all(one is not None and len(one) == count for one, count in zip(found, counts, strict=True)):
         uv = UvMap(np.concatenate([np.asarray(one, np.float64)[:, :2] for one in found]).astype(np.float32), faces)
     return SurfaceMesh(np.concatenate([part.vertices for part in parts]), faces, uv)
+
+
+def _lean(content: bytes) -> bytes:
+    """A glTF file with what a garment is made of, and nothing else.
+
+    trimesh would decode pictures, some by other programs, and repeat meshes and fill arrays as often and as far as a
+    file says. Raises `ValueError` for too much of that, and other errors for damaged files.
+    """
+    is_binary = content.startswith(b"glTF")
+    end = 20 + int.from_bytes(content[12:16], "little") if is_binary else len(content)
+    tree = parse_json(content[20 if is_binary else 0 : end])
+    if any(not one.get("uri", "data:").startswith("data:") for one in tree.get("buffers", ())):
+        raise ValueError("its numbers are in a file beside it; save it as one file, .glb")
+    if not _PACKED.isdisjoint(tree.get("extensionsRequired", ())):
+        raise ValueError("it is compressed (Draco or meshopt), which isn't read: export it without compression")
+    kept = "attributes", "indices", "mode", "material"
+    meshes = [[_of(part, *kept) for part in one["primitives"]] for one in tree.get("meshes", ())]
+    parts = [part for mesh in meshes for part in mesh]
+    for part in parts:
+        part["attributes"] = _of(part["attributes"], "POSITION", "TEXCOORD_0")
+    placed = "children", "mesh", "matrix", "rotation", "scale", "translation"
+    nodes = [_of(node, *placed) for node in tree.get("nodes", ())]
+    if len(nodes) > _MAX_NODES:
+        raise ValueError(f"it has {len(nodes)} nodes, at most {_MAX_NODES} are read: leave out what isn't cloth")
+    accessors = tree.get("accessors", ())
+    for some in (parts, [part for node in nodes if "mesh" in node for part in meshes[node["mesh"]]]):
+        _require_few_parts(len(some))
+        _require_few(sum(abs(accessors[part["indices"]]["count"]) for part in some if "indices" in part) // 3)
+        if (n := sum(abs(accessors[i]["count"]) for part in some for i in part["attributes"].values())) > _MAX_VERTICES:
+            raise ValueError(f"its pieces have {n} vertices, at most {_MAX_VERTICES} are read: join them to one")
+    used = {i for part in parts for i in (part.get("indices"), *part["attributes"].values())}
+    nothing = {"componentType": 5126, "count": 0, "type": "SCALAR"}
+    lean = _of(tree, "asset", "scene", "scenes", "buffers", "bufferViews") | {
+        "nodes": nodes,
+        "meshes": [{"primitives": mesh} for mesh in meshes],
+        "materials": [{}] * len(tree.get("materials", ())),
+        "accessors": [one if i in used else nothing for i, one in enumerate(accessors)],
+    }
+    text = json.dumps(lean).encode()
+    if not is_binary:
+        return text
+    text += b" " * (-len(text) % 4)
+    sizes = (len(text) + 20 + len(content) - end, len(text))
+    total, length = (size.to_bytes(4, "little") for size in sizes)
+    return content[:8] + total + length + content[16:20] + text + content[end:]
+
+
+def _of(values: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: values[name] for name in names if name in values}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +86,7 @@ class KeypointLayout:
     offsets: NDArray[np.float64]
     """Offset from that joint in the T-pose [m], shape (K, 3)."""
     mirrored: NDArray[np.intp]
-    """Each keypoint's counterpart on the body's other side, shape (K,); itself if it is in the middle."""
+    """Each keypoint's counterpart on the body's other side, shape (K,); itself if it is in the middle or alone."""
 
     def __len__(self) -> int:
         """Number of keypoints."""
@@ -121,10 +122,13 @@ def _place(word: str) -> tuple[str, tuple[float, float, float]]:
 
 
 def _twin(words: tuple[str, ...], i: int) -> int:
-    """The number of the same point on the other side; of several with one name, the one of the same rank."""
+    """The number of the same point on the other side; of several with one name, the one of the same rank.
+
+    Its own where there is none: somebody's skeleton may lack a hand.
+    """
     word = words[i]
     if word[:2] not in ("l_", "r_"):
         return i
     other = ("r_" if word[0] == "l" else "l_") + word[2:]
     rank = words[:i].count(word)
-    return [j for j, found in enumerate(words) if found == other][rank]
+    return next(islice((j for j, found in enumerate(words) if found == other), rank, None), i)

@@ -78,19 +78,28 @@ def read_bvh(
 def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     """The joints, one row of channels per frame, and the seconds between frames. Raises `ValueError`."""
     hierarchy, word, motion = text.partition("MOTION")
-    names = r"(?m)^(\s*(?:ROOT|JOINT)[ \t]+)(.*?)(?=\s*\{?\s*$)"
-    hierarchy = re.sub(names, lambda match: match[1] + re.sub(r"\s+", "_", match[2]), hierarchy)
     head = re.match(r"\s*Frames:\s*(\d+)\s+Frame\s+Time:\s*([-+.\deE]+)", motion) if word else None
     if head is None:
         raise ValueError("not a BVH file: wanted HIERARCHY, then MOTION, Frames: and Frame Time:")
-    joints = _joints(iter(hierarchy.split()))
+    joints = _joints(word for line in hierarchy.split("\n") for word in _words(line))
     n_channels, count = sum(len(joint.channels) for joint in joints), int(head[1])
+    if len(joints) > n_channels:  # joints that the file says nothing of would take memory in every frame
+        raise ValueError(f"wanted at least as many channels as joints, got {n_channels} and {len(joints)}")
     numbers = np.array(motion[head.end() :].split(), dtype=np.float64)
     if not 0 < count <= MAX_FRAMES or numbers.size != count * n_channels or not np.isfinite(numbers).all():
         finite = int(np.isfinite(numbers).sum())
         msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
         raise ValueError(msg)
     return joints, numbers.reshape(count, n_channels), float(head[2])
+
+
+def _words(line: str) -> list[str]:
+    """The words of a line, with a joint's name as one of them."""
+    words = line.split()
+    end = len(words) - (words[-1:] == ["{"])
+    if end < 3 or words[0] not in ("ROOT", "JOINT"):
+        return words
+    return [words[0], "_".join(words[1:end]), *words[end:]]
 
 
 def _joints(words: Iterator[str]) -> list[_Joint]:

@@ -6,13 +6,14 @@ import glob
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from msg_adapters import BAG_SUFFIXES
 from refu_core import RefuError
+from refu_core.errors import printable
 from refu_core.recordings import SUFFIXES as MOTION_SUFFIXES
 from refu_lab.fleet._storage import filesystem, is_url
 
@@ -52,7 +53,7 @@ def find_recordings(inputs: Sequence[str], *, results: Sequence[str | None] = ()
 
     Raises `RefuError` if one of `inputs` stands for nothing.
     """
-    sources: dict[str, None] = {}
+    sources: dict[str, str] = {}
     written = tuple(f"{_whole(place)}/" for place in results if place is not None)
     for text in inputs:
         found = [source for source in _find(text) if not written or not f"{_whole(source)}/".startswith(written)]
@@ -60,8 +61,9 @@ def find_recordings(inputs: Sequence[str], *, results: Sequence[str | None] = ()
             where = " beside the results" if written else ""
             msg = f"{text}: no recording there{where}; wanted bags or motions ({', '.join(SUFFIXES)}, rosbag2 folders)"
             raise RefuError(msg)
-        sources |= dict.fromkeys(found)
-    return list(_named(sources))
+        for source in found:
+            sources.setdefault(source if is_url(source) else str(_place(source)), source)
+    return list(_named(sources.values()))
 
 
 def find_data_sets(inputs: Sequence[str]) -> list[Path]:
@@ -121,12 +123,20 @@ def _walk(steps: Iterable[tuple[str, Any, Iterable[str]]], folder: str) -> Itera
             yield from (str(place / name) for name in mine)
 
 
-def _named(sources: Iterable[str]) -> Iterator[Input]:
+def _place(source: str) -> PurePosixPath:
+    """Where a recording is, without `..`: results would be written outside of their folder. Raises `RefuError`."""
+    if not is_url(source):  # a link in it may lead elsewhere: only the system knows what is above that
+        path = Path(source).absolute()
+        return PurePosixPath(path if ".." not in path.parts else Path(os.path.realpath(path.parent), path.name))
+    place = PurePosixPath(source.partition("://")[2])
+    if ".." in place.parts:
+        raise RefuError(printable(f"{source}: wanted a name without '..', which leads out of a folder: rename it"))
+    return place
+
+
+def _named(sources: Collection[str]) -> Iterator[Input]:
     """The inputs, named by what distinguishes their paths."""
-    paths = {
-        source: PurePosixPath(source.partition("://")[2] if is_url(source) else str(Path(source).absolute()))
-        for source in sources
-    }
+    paths = {source: _place(source) for source in sources}
     one_root = len({path.is_absolute() for path in paths.values()}) == 1
     shared = os.path.commonpath([path.parent for path in paths.values()]) if one_root else ""
     short = {

@@ -49,7 +49,12 @@ def fetched(source: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="refu-") as folder:
         here = Path(folder) / path.rstrip("/").rsplit("/", maxsplit=1)[-1]
         try:
-            fs.get(path, str(here), recursive=fs.isdir(path))
+            is_folder = fs.isdir(path)
+            if any(".." in name.split("/") for name in (fs.find(path) if is_folder else [path])):
+                raise RefuError(
+                    f"{source}: wanted names without '..', which lead out of a folder: rename what has them"
+                )
+            fs.get(path, str(here), recursive=is_folder)
         except OSError as error:
             raise RefuError(f"{source}: can't be read: {error}") from error
         yield here

@@ -9,6 +9,7 @@ from textwrap import fill
 from typing import Any
 from urllib.parse import quote
 
+from refu_core.errors import printable
 from refu_lab.tables import REPLAY_TITLE, format_table, html_page, html_table, meanings, replay_columns
 
 _HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
@@ -107,8 +108,8 @@ def fleet_table(result: FleetResult) -> str:
         lines += ["", "worst frames", format_table(_WORST_HEADER, worst)]
     done, kept = len(result.rows) - len(result.failed), sum(bool(row.get("kept")) for row in result.rows)
     lines += ["", f"{done} of {len(result.rows) + result.n_left} recordings replayed, {kept} of them before"]
-    lines += [f"{row['name']}: {row['error']}" for row in result.failed]
-    lines += [f"warning: {warning}" for warning in result.warnings()]
+    lines += [f"{printable(row['name'])}: {row['error']}" for row in result.failed]
+    lines += [printable(f"warning: {warning}") for warning in result.warnings()]
     if result.interrupted:
         goes_on = "give the same command again to go on" if result.is_kept else "nothing is kept without --output"
         lines.append(f"interrupted: {goes_on}")
@@ -117,11 +118,18 @@ def fleet_table(result: FleetResult) -> str:
 
 def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     if "error" in row:
-        return (row["name"], *["-"] * (len(_HEADER) - 2), "failed")
+        return (printable(row["name"]), *["-"] * (len(_HEADER) - 2), "failed")
     latency = [f"{row['latency_ms'][p]:.1f}" for p in ("p50", "p95")]
     figures = ["-" if row.get(name) is None else f"{row[name]:.{digits}f}" for name, digits in _FIGURES]
     skipped = str(sum(row["skipped"].values()))
-    return (row["name"], str(row["frames"]), skipped, *latency, *figures, "before" if row.get("kept") else "done")
+    return (
+        printable(row["name"]),
+        str(row["frames"]),
+        skipped,
+        *latency,
+        *figures,
+        "before" if row.get("kept") else "done",
+    )
 
 
 _FIGURES = (("vfcp_percent", 3), ("free_percent", 1), ("max_depth_mm", 1))
@@ -129,7 +137,7 @@ _FIGURES = (("vfcp_percent", 3), ("free_percent", 1), ("max_depth_mm", 1))
 
 def _worst_cells(frame: Mapping[str, Any]) -> tuple[str, ...]:
     counts = (str(frame["frame"]), f"{frame['time_s']:.2f}", str(frame["n_inside"]), str(frame["n_pairs"]))
-    return (frame["name"], *counts, f"{frame['max_depth_mm']:.1f}")
+    return (printable(frame["name"]), *counts, f"{frame['max_depth_mm']:.1f}")
 
 
 def _merged(parts: list[Mapping[str, Any]]) -> dict[str, Any]:

@@ -67,7 +67,7 @@ class Player:
             if seek is not None:
                 self._moment = float(self._times[seek])
             elif self._playing:
-                self._moment += past * _SPEEDS[self._speed.value]
+                self._moment += past * self._pace
                 if self._moment >= self._length:
                     self._moment %= self._length
                 index = int(np.searchsorted(self._times, self._moment, side="right")) - 1
@@ -81,7 +81,12 @@ class Player:
         if not self._playing:
             return _IDLE_S
         following = self._times[self._index + 1] if self._index + 1 < len(self._times) else self._length
-        return float(np.clip((following - self._moment) / _SPEEDS[self._speed.value], 0.001, _IDLE_S))
+        return float(np.clip((following - self._moment) / self._pace, 0.001, _IDLE_S))
+
+    @property
+    def _pace(self) -> float:
+        """How fast the film plays. As everywhere here, what a client sends need not be one of the choices."""
+        return _SPEEDS.get(self._speed.value, 1.0)
 
     @property
     def _length(self) -> float:
@@ -111,8 +116,8 @@ class Player:
         self._said.content = "  \n".join(facts)
 
     def _bands(self, shapes: Sequence[SceneMesh]) -> list[tuple[SceneMesh, Sequence[Band]]]:
-        shown = _BODIES[self._body.value]
-        marking = Marking(self._marking.value)
+        shown = _BODIES.get(self._body.value)
+        marking = next((one for one in Marking if one == self._marking.value), Marking.CLOTH)
         found: list[tuple[SceneMesh, Sequence[Band]]] = []
         for person in dict.fromkeys(shape.person for shape in shapes):
             own = [shape for shape in shapes if shape.person == person]
@@ -195,7 +200,7 @@ class Player:
 
     def _sought(self, event: Any) -> None:
         if event.client is not None:  # a user moved it; the player's own changes trigger this, too
-            self._seek = int(self._frame.value)
+            self._seek = min(max(int(self._frame.value), 0), len(self._times) - 1)
             self._changed.set()
 
     def _toggle(self, _event: Any) -> None:

@@ -23,6 +23,8 @@ from refu_lab.view._film import SceneMesh
 
 _FARTHEST = 1e6
 """Markers with coordinates beyond this aren't drawn [m]."""
+_MOST_SHOWN = 500
+"""Meshes on show; of more, those that came first are forgotten. Without a lifetime they would stay for ever."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,8 @@ class MarkerScene(Generic[_Kept]):
     def shown(self, now_ns: float) -> list[_Kept]:
         """What is on show at a time by the receiver's clock [ns]; the rest is forgotten."""
         self._shown = {key: one for key, one in self._shown.items() if now_ns < one[1]}
+        here = {key[1:] for key in self._shown}
+        self._topologies = {key: one for key, one in self._topologies.items() if key in here}
         return [kept for kept, _ in self._shown.values()]
 
     def take(self, topic: str, data: bytes, now_ns: int) -> tuple[int, int]:
@@ -101,6 +105,8 @@ class MarkerScene(Generic[_Kept]):
         for marker in drawable:
             until_ns = now_ns + marker.lifetime_ns if marker.lifetime_ns > 0 else np.inf
             self._shown[topic, marker.ns, marker.id] = self._keep(self.shape(marker)), until_ns
+        for key in [*self._shown][:-_MOST_SHOWN]:
+            del self._shown[key]
         return max((marker.stamp_ns or now_ns for marker in drawable), default=0), len(meshes) - len(drawable)
 
     def shape(self, marker: Marker) -> SceneMesh:

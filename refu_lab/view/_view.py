@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import socket
 import sys
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -101,8 +103,25 @@ def _serve(options: ViewOptions) -> viser.ViserServer:
     if not _is_free(options.host, options.port or 0):
         where = options.host if options.port is None else f"{options.host}:{options.port}"
         raise RefuError(f"{where} can't be listened on: it is taken, or no address of this machine (--port, --host)")
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner
+    with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(options.host):  # it prints a banner
         return viser.ViserServer(host=options.host, port=options.port or DEFAULT_PORT, verbose=False)
+
+
+@contextlib.contextmanager
+def _own_pages_only(host: str) -> Iterator[None]:
+    """Lets servers that begin in the block serve no page of another site, if they listen on this machine alone.
+
+    Browsers let any page of the web connect to a websocket on `localhost`, and viser serves whoever connects.
+    """
+    from websockets.asyncio import server
+
+    serve, here = server.serve, re.compile(rf"https?://(localhost|127\.0\.0\.1|\[::1\]|{re.escape(host)})(:\d+)?")
+    if host not in ("0.0.0.0", "::"):
+        server.serve = partial(serve, origins=[None, here])  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc]
 
 
 def _stop(server: viser.ViserServer) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from msg_adapters import BagError, BagReader, decoder_for, encoder_for, open_smpl_bag
 from refu_core import SmplFrame
+from tests.limits import refusal, run_limited
 
 TOPIC = "/smpl_params"
 TYPE = "sensor_msgs/msg/JointState"
@@ -137,6 +139,51 @@ def test_what_a_damaged_database_is_called_need_not_be_text(tmp_path: Path) -> N
     with pytest.raises(BagError, match=r"named\.db3: the database can't be read") as caught:
         BagReader(path)
     assert str(caught.value).isprintable()
+
+
+def shared(path: Path, *, table: str, depth: int) -> Path:
+    """A bag of which each page of a table is there 583 times, and so on, `depth` times: 28 KB with 10¹¹ rows."""
+    handmade(path, messages=rows(0, 1))
+    with sqlite3.connect(path) as database:
+        (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = ?", (table,)).fetchone()
+    database.close()
+    data = bytearray(path.read_bytes())
+    (size,) = struct.unpack_from(">H", data, 16)
+    at = slice((root - 1) * size, root * size)
+    data += data[at]
+    for i in range(depth):
+        n = (size - 12) // 7
+        page = struct.pack(">BHHHBI", 5, 0, n, size - 5 * n, 0, len(data) // size)
+        page += b"".join(struct.pack(">H", size - 5 * (k + 1)) for k in range(n))
+        page += bytes(size - 5 * n - len(page)) + struct.pack(">IB", len(data) // size, 0x7F) * n
+        data[at if i == depth - 1 else slice(len(data), None)] = page
+    struct.pack_into(">I", data, 28, len(data) // size)
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("table", ["messages", "topics"])
+def test_pages_that_are_shared_take_no_time(tmp_path: Path, table: str) -> None:
+    path = shared(tmp_path / "shared.db3", table=table, depth=4)
+
+    def read() -> None:
+        reader = BagReader(path)
+        counted = sum(topic.message_count for topic in reader.topics)
+        assert sum(1 for _ in reader.messages()) == counted
+        assert (counted > 10_000) == (table == "messages")  # nothing is told apart where topics are endless
+        assert "of this size has; the rest is left out" in reader.warnings[0]
+
+    assert run_limited(read).error == ""
+
+
+def test_a_scheme_that_is_shared_takes_no_time(tmp_path: Path) -> None:
+    """Its rows are parsed by SQLite itself, before the first query."""
+    path = shared(tmp_path / "shared.db3", table="messages", depth=4)
+    data = bytearray(path.read_bytes())
+    size, root = struct.unpack_from(">H", data, 16)[0], 3
+    data[100:size] = data[(root - 1) * size : root * size - 100]
+    path.write_bytes(data)
+    assert refusal(lambda: BagReader(path))
 
 
 @given(st.data())

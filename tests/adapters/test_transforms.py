@@ -230,6 +230,8 @@ def test_frames_of_people_who_have_left_are_forgotten() -> None:
     many = [transform("map", f"f{i}") for i in range(10_000)]
     assert put(buffer, *many) > 0
     assert buffer.is_full
+    put(buffer, *[transform("map", "f0", i) for i in range(1, 150)])
+    assert len(buffer._tracks["f0"].stamps) == 100  # 10,000 of each, as where there are few, would be 26 GB
     for _ in range(2):
         now += 10.0
         put(buffer, transform("map", "base"))

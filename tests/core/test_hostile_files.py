@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import pickle
 import pickletools
 import struct
@@ -10,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ import pytest
 from msg_adapters import read_motion
 from refu_core import load_body
 from refu_core._pickle_machine import NAMES
+from refu_core.fitting import read_surface
 from tests.core.test_body import random_model
 from tests.core.test_files import SPECIAL
 from tests.limits import refusal, run_limited, said
@@ -292,3 +295,115 @@ def test_what_is_no_file(tmp_path: Path, lay: Callable[[Path], object], said: st
 def test_a_slow_rate_is_not_resampled_to_gigabytes(tmp_path: Path) -> None:
     path = archive(tmp_path, poses=npy(np.zeros((2000, 72))), mocap_framerate=npy(0.001))
     assert "at most 1000000 are made" in refusal(lambda: read_motion(path).resampled(30))
+
+
+# Text and meshes ----------------------------------------------------------------------------------
+
+ONE_ROOT = "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n"
+MOTION = "MOTION\nFrames: 1\nFrame Time: 0.03\n0\n"
+BVHS = {
+    "empty lines": "HIERARCHY\n" + "\n" * 1_000_000 + MOTION,
+    "a name of spaces": f"HIERARCHY\nROOT a{' ' * 1_000_000}b\n{MOTION}",
+    "joints without numbers": ONE_ROOT
+    + "JOINT b\n{\nOFFSET 0 1 0\nCHANNELS 0\n}\n" * 998
+    + "}\nMOTION\nFrames: 500000\nFrame Time: 0.03\n"
+    + "0 " * 500_000,
+}
+
+
+@pytest.mark.parametrize("text", BVHS.values(), ids=BVHS)
+def test_hostile_bvh(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.bvh").write_text(text)
+    assert refusal(lambda: read_motion(tmp_path / "a.bvh")).isprintable()
+
+
+TRIANGLE = np.eye(3, dtype="<f4").tobytes() + np.zeros((3, 2), "<f4").tobytes() + np.arange(3, dtype="<u4").tobytes()
+
+
+def gltf(blob: bytes = TRIANGLE, **changes: Any) -> bytes:
+    """A triangle in a GLB, with other values at the top of its JSON."""
+    ends = (0, 36, 60, 72, len(blob))
+    views = [{"buffer": 0, "byteOffset": a, "byteLength": b - a} for a, b in pairwise(ends) if b > a]
+    kinds = ((5126, "VEC3"), (5126, "VEC2"), (5125, "SCALAR"))
+    part = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [part]}],
+        "materials": [{}],
+        "accessors": [
+            {"bufferView": i, "componentType": number, "count": 3, "type": kind}
+            for i, (number, kind) in enumerate(kinds)
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    text = json.dumps(tree | changes).encode()
+    text, blob = text + b" " * (-len(text) % 4), blob + bytes(-len(blob) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(blob), len(text), 0x4E4F534A)
+    return head + text + struct.pack("<II", len(blob), 0x004E4942) + blob
+
+
+def pictured(picture: bytes) -> bytes:
+    """A triangle with a texture."""
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    images = {"images": [{"bufferView": 3, "mimeType": "image/png"}], "textures": [{"source": 0}]}
+    return gltf(TRIANGLE + picture, materials=[material], **images)
+
+
+def far(*names: str) -> list[dict[str, Any]]:
+    """Accessors of a triangle, of which these have no bytes but many entries."""
+    numbers = {"places": (5126, "VEC3"), "uv": (5126, "VEC2"), "corners": (5125, "SCALAR")}
+    return [
+        {"componentType": number, "type": kind, "count": 10**9}
+        if name in names
+        else {"componentType": number, "type": kind, "count": 3, "bufferView": i}
+        for i, (name, (number, kind)) in enumerate(numbers.items())
+    ]
+
+
+def lid(n: int) -> str:
+    return "".join(f"v {np.cos(t):.5f} {np.sin(t):.5f} 0\n" for t in 2 * np.pi * np.arange(n) / n)
+
+
+PARTS: Any = [{"attributes": {"POSITION": 0}, "indices": 2}]
+CORNERS = b"vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+FACET = b"solid a\nfacet normal 0 0 0\nouter loop\n" + CORNERS + b"endloop\nendfacet\nendsolid a\n"
+MESHES = {
+    "a place for everybody.glb": gltf(accessors=far("places")),
+    "uv for everybody.glb": gltf(accessors=far("uv")),
+    "corners for everybody.glb": gltf(accessors=far("corners")),
+    "less than nothing.glb": gltf(accessors=[one | {"count": -one["count"]} for one in far("uv")]),
+    "one mesh often.glb": gltf(nodes=[{"children": [*range(1, 20_000)]}, *[{"mesh": 0}] * 19_999]),
+    "one part often.glb": gltf(meshes=[{"primitives": PARTS * 10_000}]),
+    "a chain.glb": gltf(nodes=[*({"children": [i + 1]} for i in range(20_000)), {"mesh": 0}]),
+    "a ring.glb": gltf(nodes=[{"children": [1]}, {"children": [2], "mesh": 0}, {"children": [1]}]),
+    "a file beside it.glb": gltf(buffers=[{"byteLength": 48, "uri": "/etc/passwd"}]),
+    "a file and none.glb": gltf(
+        buffers=[{"byteLength": 48, "uri": "/etc/passwd"}, {"byteLength": 3, "uri": "data:,x"}]
+    ),
+    "brackets.gltf": b"[" * 500_000,
+    "lids.obj": (lid(1000) + ("f " + " ".join(map(str, range(1, 1001))) + "\n") * 200).encode(),
+    "solids.stl": FACET * 8000,
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_hostile_meshes(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(MESHES[name])
+    assert "not a mesh that can be read" in refusal(lambda: read_surface(tmp_path / name))
+
+
+def test_pictures_on_a_mesh_are_not_looked_at(tmp_path: Path) -> None:
+    """Pillow runs Ghostscript for some, and unpacks half a gigabyte of half a megabyte for others."""
+    for picture in (
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n(x) print\n%%EOF\n",
+        b"no picture",
+    ):
+        (tmp_path / "a.glb").write_bytes(pictured(picture))
+        mesh = read_surface(tmp_path / "a.glb")
+        assert len(mesh.faces) == 1
+        assert mesh.uv is not None
+        np.testing.assert_array_equal(mesh.vertices, np.eye(3))

@@ -370,6 +370,18 @@ def test_bvh(tmp_path: Path, names: str, prefix: str, unit: float, said: str) ->
     assert np.linalg.norm(got - joints, axis=2)[:, limbs].max() < 0.012
 
 
+def test_bvh_of_somebody_with_one_hand(tmp_path: Path) -> None:
+    """It ended in a traceback: the other side of the hand was looked for."""
+    for n, name in enumerate(("LeftHand", "RightFoot")):
+        text, joints = bvh(MIXAMO.replace(name, "Hook").split(), 100.0)
+        (tmp_path / f"{n}.bvh").write_text(text)
+        motion = read_motion(tmp_path / f"{n}.bvh")
+        body = load_body("neutral")
+        got = body(motion.poses, motion.betas[None], motion.transl.astype(np.float32)).joints.numpy()
+        limbs = [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in ("knee", "elbow")]
+        assert np.linalg.norm(got - joints, axis=2)[:, limbs].max() < 0.02
+
+
 def test_bvh_that_is_refused(tmp_path: Path) -> None:
     text, _ = bvh(MIXAMO.split(), 100.0, n=2)
     path = tmp_path / "a.bvh"

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import bz2
+import contextlib
 import io
 import json
 import lzma
 import pickle
+import sqlite3
 import struct
 import zlib
 from dataclasses import asdict
@@ -14,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import trimesh
 from mcap.writer import CompressionType, Writer
 from scipy.sparse import coo_array, csr_array, lil_array
 
@@ -297,3 +300,67 @@ def set_files(kind: str) -> dict[str, bytes]:
         "settings": asdict(MlpConfig((0,))),
     }
     return {"card.json": json.dumps(card).encode(), **files}
+
+
+def sqlite_bag(path: Path) -> bytes:
+    """A bag in rosbag2's other storage."""
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)")
+        database.execute(
+            "INSERT INTO topics VALUES (1, '/multiarray/smpl_params', ?, 'cdr')", (adapters.INPUT_TYPES["multiarray"],)
+        )
+        data = adapters.encoder_for("multiarray")(some_frame())
+        database.executemany("INSERT INTO messages VALUES (?, 1, ?, ?)", [(i, i, data) for i in range(1, 20)])
+    return path.read_bytes()
+
+
+BVH_WORDS = (
+    b"JOINT a b\n{\n",
+    b"\n",
+    b" ",
+    b"}",
+    b"End Site\n{\n",
+    b"CHANNELS 0\n",
+    b"CHANNELS 1000000 ",
+    b"0 ",
+    b"1e999 ",
+)
+
+
+def _bvh() -> bytes:
+    """A skeleton of chains from the hips, by Mixamo's names."""
+    chains = [f"{side}UpLeg {side}Leg {side}Foot" for side in ("Left", "Right")]
+    chains += ["Spine Neck Head", *(f"{side}Arm {side}ForeArm {side}Hand" for side in ("Left", "Right"))]
+    ways = ["0.1 0 0", "0 -0.4 0", "0 -0.4 0"], ["-0.1 0 0", "0 -0.4 0", "0 -0.4 0"], ["0 0.3 0", "0 0.25 0", "0 0.1 0"]
+    ways += ["0.2 0.5 0", "0.25 0 0", "0.25 0 0"], ["-0.2 0.5 0", "-0.25 0 0", "-0.25 0 0"]
+    turn = "CHANNELS 3 Zrotation Yrotation Xrotation"
+    lines = ["HIERARCHY", "ROOT Hips", "{", "OFFSET 0 0 0", turn]
+    for names, offsets in zip(chains, ways, strict=True):
+        for name, offset in zip(names.split(), offsets, strict=True):
+            lines += [f"JOINT {name}", "{", f"OFFSET {offset}", turn]
+        lines += ["}"] * 3
+    return "\n".join([*lines, "}", "MOTION", "Frames: 2", "Frame Time: 0.03", *["0 " * 48] * 2]).encode()
+
+
+BVH = _bvh()
+MESH_WORDS = (
+    b"f 1 2 3\n",
+    b"f 1/1 -1//2 3 4 5 6\n",
+    b"v 0 0 0\n",
+    b"nan ",
+    b"1e999 ",
+    b"element face 1000000000\n",
+    b"solid a\n",
+)
+
+
+def meshes() -> dict[str, bytes]:
+    """A small mesh in each format, by its suffix."""
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    found: dict[str, bytes] = {}
+    for kind in ("obj", "ply", "stl", "off", "glb"):
+        content: str | bytes = mesh.export(file_type=kind)
+        found[f".{kind}"] = content.encode() if isinstance(content, str) else content
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh), embed_buffers=True)
+    return found | {".gltf": files["model.gltf"]}

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 import msg_adapters as adapters
 from refu_core import FrameError, load_body
 from refu_core.backbones import MlpConfig, TailorNetConfig
+from refu_core.fitting import read_surface
 from refu_core.refu import trained_from_weights
 from refu_core.sdf._neural import SDF_PRESETS, SdfNetwork, load_sdf_network, save_sdf_network
 from refu_core.simulation import GarmentDataset, GarmentSequences, load_clips
@@ -115,6 +116,41 @@ def _motion_pickle(folder: Path) -> Reader:
                 ms.check_frame(motion.frame(i))
 
     return near_file(near(corpus.motion_pickles(), corpus.GADGETS)), read
+
+
+def _sqlite(folder: Path) -> Reader:
+    path = folder / "bag.db3"
+
+    def read(content: bytes | Special) -> None:
+        place(path, content)
+        _read_bag(path)
+
+    return near_file(near([corpus.sqlite_bag(folder / "seed.db3")])), read
+
+
+def _bvh(folder: Path) -> Reader:
+    path = folder / "file.bvh"
+
+    def read(content: bytes | Special) -> None:
+        place(path, content)
+        adapters.read_motion(path)
+
+    return near_file(near([corpus.BVH], corpus.BVH_WORDS)), read
+
+
+def _mesh(folder: Path) -> Reader:
+    seeds = corpus.meshes()
+
+    def read(drawn: tuple[str, bytes | Special]) -> None:
+        suffix, content = drawn
+        place(folder / f"file{suffix}", content)
+        read_surface(folder / f"file{suffix}")
+
+    def one(suffix: str) -> SearchStrategy[tuple[str, bytes | Special]]:
+        contents = near_json([seeds[suffix]]) if suffix == ".gltf" else near([seeds[suffix]], corpus.MESH_WORDS)
+        return st.tuples(st.just(suffix), near_file(contents))
+
+    return st.one_of(*map(one, seeds)), read
 
 
 def _motion(folder: Path) -> Reader:
@@ -284,6 +320,9 @@ _ALL = (
     Target("arguments", "command lines", ms.arguments),
     Target("mcap", "MCAP files", _mcap, 40),
     Target("bag", "rosbag2 directories", _bag_folder, 40),
+    Target("db3", "SQLite bags", _sqlite, 40),
+    Target("bvh", "motion as .bvh", _bvh),
+    Target("mesh", "meshes of garments: .obj, .ply, .stl, .off, .glb, .gltf", _mesh),
     Target("motion", "AMASS-style .npz", _motion),
     Target("motion_pkl", "motion as .pkl, as trackers write it", _motion_pickle),
     Target("body_npz", "bodies as .npz", _body("file.npz", lambda: near_zip(corpus.body_archives()))),

@@ -15,7 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import pytest
+from fsspec.implementations.memory import MemoryFile
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,6 +28,7 @@ from refu_lab.cli import main
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import find_recordings, fleet_table, is_plain, open_engine
 from refu_lab.fleet._engine import DaskEngine, FleetError, run_function
+from refu_lab.fleet._storage import fetched
 from refu_lab.fleet._summary import FleetResult
 from refu_lab.fleet.replay import _CODE, _content
 from tests.lab import fleet_tasks
@@ -137,6 +140,22 @@ def test_no_two_recordings_have_one_name(tmp_path_factory: pytest.TempPathFactor
     assert not any(one.name.startswith(f"{other.name}/") for one in found for other in found)  # its report is a folder
 
 
+def test_no_result_leaves_its_folder(bags: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`refu replay walk.mcap ../b --output out` wrote out/../b/walk.mcap."""
+    monkeypatch.chdir(bags / "a")
+    assert names("walk.mcap", "../b", "../a/walk.mcap") == ["a/walk", "b/broken", "b/walk"]
+    store = fsspec.filesystem("memory")
+    for name in ("/fleet/bag/metadata.yaml", "/fleet/bag/../../../home/.bashrc", "/fleet/../../evil.mcap"):
+        store.store[name] = MemoryFile(store, name, b"x")
+    try:
+        with pytest.raises(RefuError, match=r"wanted a name without '\.\.', which leads out of a folder"):
+            names("memory://fleet/**")
+        with pytest.raises(RefuError, match="wanted names without"), fetched("memory://fleet/bag"):
+            pass
+    finally:
+        store.store.clear()
+
+
 # ---- what is done ----------------------------------------------------------------------------------------------------
 
 
@@ -160,6 +179,13 @@ def test_what_there_is_to_warn_of_is_said_of_many_as_of_one() -> None:
     assert '<p class="warn">z up &lt;is&gt; taken (r0 and 2 others)</p><p class="warn">cm (r1)</p>' in result.page()
     many = FleetResult(rows=[{"name": "r", **ROW, "warnings": [str(i) for i in range(25)]}])
     assert many.warnings()[-1] == "15 other warnings: --json names all"
+
+
+def test_names_of_files_are_no_commands_to_the_terminal() -> None:
+    rows = [
+        ROW | {"name": f"\x1b[2J{i}", "warnings": [f"odd {i}"], **more} for i, more in enumerate(({}, {"error": "x"}))
+    ]
+    assert fleet_table(FleetResult(rows)).replace("\n", "").isprintable()
 
 
 def test_a_bad_bag_is_reported_and_the_rest_is_done(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:

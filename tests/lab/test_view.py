@@ -12,6 +12,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import browser
@@ -35,7 +36,7 @@ from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
 from refu_lab.view._marks import CLEARANCE, BandFinder, Marking
 from refu_lab.view._player import Player
 from refu_lab.view._recorded import MarkerScene, RecordedFilm, Topology, is_drawable
-from refu_lab.view._view import open_film
+from refu_lab.view._view import _serve, open_film
 
 ROOT = Path(__file__).parents[2]
 SHORTS = ("short-pant-male",)
@@ -168,6 +169,15 @@ def test_markers_that_make_no_picture_are_left_out_and_a_rotation_unset_is_none(
         replace(whole, pose=(0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0)),
     ):
         assert not is_drawable(odd)
+
+
+def test_meshes_that_stay_for_ever_are_forgotten_in_the_end() -> None:
+    scene: MarkerScene[SceneMesh] = MarkerScene(lambda shape: shape)
+    for i in range(600):
+        scene.take("/garments", triangle(f"p{i}/shirt", 1), 0)
+    people = [shape.person for shape in scene.shown(1)]
+    assert people == [f"p{i}" for i in range(100, 600)]
+    assert len(scene._topologies) == 500
 
 
 def test_a_robots_own_markers_keep_nobody_from_being_dressed(tmp_path: Path) -> None:
@@ -328,6 +338,19 @@ def test_the_player_plays_seeks_and_dresses_anew(film: DressedFilm, server: Any)
     film.wear(SHORTS, "hybrid")
 
 
+def test_whatever_a_client_sends_the_film_goes_on(film: DressedFilm, server: Any) -> None:
+    """viser checks neither choices nor ranges: a number beyond the film ended the viewer."""
+    player = Player(server, film)
+    for handle in (player._speed, player._body, player._marking, player._sdf):
+        handle._impl.value = "\x1b[31m"
+    for frame in (10**9, -5):
+        player._frame._impl.value = frame
+        player._sought(SimpleNamespace(client=server))
+        player.run(until=until(2))
+        assert 0 <= player._index < 5
+    assert film.sdf == "hybrid"
+
+
 # ---- the command -----------------------------------------------------------------------------------------------------
 
 
@@ -432,6 +455,25 @@ def running(bag: Path, *garments: str) -> Iterator[list[str]]:
     finally:
         end.set()
         thread.join()
+
+
+def test_pages_of_other_sites_are_not_served() -> None:
+    """Any page of the web may connect to localhost, and read the people who are shown there."""
+    viser = pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    server = _serve(ViewOptions(dressing=RecordingOptions(input=Path())))
+    try:
+        port, spoken = server.get_port(), [f"viser-v{viser.__version__}"]
+        for origin in (f"http://localhost:{port}", "http://127.0.0.1:9090", None):
+            with connect(f"ws://localhost:{port}", origin=origin, subprotocols=spoken) as page:
+                assert page.recv(timeout=10)
+        for origin in ("https://evil.example", f"http://localhost.evil.example:{port}", "null"):
+            with pytest.raises(InvalidStatus, match="403"), connect(f"ws://localhost:{port}", origin=origin):
+                pass
+    finally:
+        server.stop()
 
 
 def test_an_interrupt_closes_the_viewer(bag: Path) -> None:
