@@ -195,6 +195,7 @@ def asked_path(settings: NodeSettings, name: str) -> Path:
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""
 _INTERRUPTED = 130
+NOT_BEGUN = "cancelled before a frame was done"
 
 
 class BagJob:
@@ -242,7 +243,7 @@ class BagJob:
                 result: dict[str, Any] = json.loads(self._result.read_bytes())
                 return result
         if code in (_INTERRUPTED, -signal.SIGTERM):
-            said = "cancelled before a frame was done"
+            said = NOT_BEGUN
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
 
     def cancel(self) -> None:

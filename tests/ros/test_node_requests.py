@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
 from harness import GARMENTS, PATIENCE_S, ROOT, NodeProcess, Peer, frame, ros_arguments
 from rclpy.action import ActionClient
 from scipy.spatial.transform import Rotation
@@ -98,6 +99,16 @@ class Replayer:
             (message.feedback.frames_done, message.feedback.frames_total)
         )
         return self._done(self._client.send_goal_async(self._type.Goal(**goal), feedback_callback=told))
+
+    def begin_and_cancel(self, **goal: Any) -> Any:
+        """The handle of a goal that is cancelled, with all others, before the node has said that it accepts it."""
+        cancel = self._peer.node.create_client(CancelGoal, "garment_node/replay_bag/_action/cancel_goal")
+        self._peer.spin_until(cancel.service_is_ready, "goals can be cancelled")
+        begun, asked = self._client.send_goal_async(self._type.Goal(**goal)), cancel.call_async(CancelGoal.Request())
+        handle = self._done(begun)
+        if not self._done(asked).goals_canceling:  # the request has overtaken the goal
+            self.cancel(handle)
+        return handle
 
     def result(self, handle: Any) -> tuple[int, Any]:
         """Status and result."""
@@ -286,6 +297,9 @@ def test_one_bag_at_a_time_and_it_can_be_cancelled(peer: Peer, bags: Path) -> No
     assert 0 < result.frames < 20_000
     with BagReader(result.output) as bag:
         assert not bag.truncated
+    status, result = replayer.result(replayer.begin_and_cancel(bag="endless.mcap", garments=GARMENTS[:1], sdf="none"))
+    assert (status, result.output) == (GoalStatus.STATUS_CANCELED, "")
+    assert "before a frame was done" in result.message
 
 
 def test_a_bag_that_is_cancelled_before_its_first_frame_has_no_figures() -> None:
