@@ -24,7 +24,7 @@ import msg_adapters as adapters
 from msg_adapters import BagReader, BagWriter
 from msg_adapters.axes import SMPL_COLUMNS
 from refu_core import GarmentPipeline, RefuError, SmplFrame
-from refu_ros._beside import BagJob
+from refu_ros._beside import BagJob, RequestDresser
 from refu_ros._node import GarmentNode
 from refu_ros._requests import _fill
 from refu_ros._settings import NodeSettings
@@ -245,6 +245,17 @@ def test_a_recording_says_where_it_is(peer: Peer, bags: Path) -> None:
         ended = record(start=False)
         assert (ended.success, ended.path) == (True, begun.path)
     assert not record(start=False).success
+
+
+def test_requests_that_wait_when_the_node_ends_are_told_so() -> None:
+    dresser, settings = RequestDresser(), NodeSettings(garments=GARMENTS[:1], backbone="skinned", sdf="none")
+    waiting = [dresser.ask(frame(i), settings, lambda *_: None) for i in range(3)]
+    dresser.close()
+    with pytest.raises(RefuError, match="shut down or failed before"):
+        waiting[-1].result()
+    again = dresser.ask(frame(1), settings, lambda output, _: output)
+    assert GARMENTS[0] in again.result()
+    dresser.close()
 
 
 def test_a_bag_is_dressed_beside_the_stream(peer: Peer, bags: Path) -> None:
