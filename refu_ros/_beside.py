@@ -117,18 +117,20 @@ class RequestDresser:
             raise RefuError(f"{_MOST_WAITING} requests wait already: ask again when one has been answered")
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, "dresser", initializer=_give_way)
-        asked = self._pool.submit(self._dress, frame, settings, then)
+        asked = self._pool.submit(self._dress, self._pool, frame, settings, then)
         asked.add_done_callback(lambda _: self._waiting.release())
         return asked
 
     def close(self) -> None:
-        """Waits for the frame that is being dressed."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-        self._pool = None
+        """Waits for the frame that is being dressed; requests that wait are refused. Further ones may follow."""
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown()
         self._load.cache_clear()
 
-    def _dress(self, frame: SmplFrame, settings: NodeSettings, then: Then) -> object:
+    def _dress(self, pool: ThreadPoolExecutor, frame: SmplFrame, settings: NodeSettings, then: Then) -> object:
+        if pool is not self._pool:
+            raise RefuError("the node was shut down or failed before this request's turn: ask again when it runs")
         pipeline = self._load(settings.pipeline).pipeline
         up = up_of_sender(settings.axes, settings.frame_id, np.eye(3))
         frame = replace(settings.applied(frame), up=up)
@@ -195,6 +197,7 @@ def asked_path(settings: NodeSettings, name: str) -> Path:
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""
 _INTERRUPTED = 130
+NOT_BEGUN = "cancelled before a frame was done"
 
 
 class BagJob:
@@ -242,7 +245,7 @@ class BagJob:
                 result: dict[str, Any] = json.loads(self._result.read_bytes())
                 return result
         if code in (_INTERRUPTED, -signal.SIGTERM):
-            said = "cancelled before a frame was done"
+            said = NOT_BEGUN
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
 
     def cancel(self) -> None:

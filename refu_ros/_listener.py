@@ -261,7 +261,7 @@ class Listener:
 
     def _on_camera(self, data: bytes) -> None:
         self._camera = adapters.decode_camera_info(data)
-        self._need_transforms("the camera", self._camera.frame_id)
+        self._need_transforms("the camera", printable(self._camera.frame_id))
 
     def _need_transforms(self, who: str, given: str) -> bool:
         """Subscribes to transforms once a frame isn't that of the messages; returns whether it differs."""

@@ -22,7 +22,7 @@ from msg_adapters import MESH, encode_mesh
 from msg_adapters.bags import free_path
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_ros._beside import BagJob, RequestDresser, asked_frame, asked_path, asked_settings
+from refu_ros._beside import NOT_BEGUN, BagJob, RequestDresser, asked_frame, asked_path, asked_settings
 from refu_ros._guard import answer_no
 from refu_ros._interfaces import interface
 
@@ -137,6 +137,8 @@ class Requests:
 
     def _begin(self, goal: Any) -> BagJob:
         request = goal.request
+        if goal.is_cancel_requested:  # between being accepted and getting its turn
+            raise RefuError(NOT_BEGUN)
         if self._job is not None:
             raise RefuError("another bag is being dressed: wait for it, or cancel it")
         settings = asked_settings(request, self._node.settings)

@@ -23,6 +23,8 @@ TOLERANCE = 0.002
 """A vertex this far behind a surface still counts as on it [m]: less than the margin that cloth keeps from the skin."""
 BUFFER_WIDTH = 480
 """Width of the depth buffer [pixels], unless the camera has fewer: 5 mm each at 2 m, a third of a garment's edges."""
+_TALLEST = 4
+"""Most rows of the depth buffer, in its widths: drawing into 480 x 32,768 pixels took a hundred times as long."""
 
 Mesh = tuple[ArrayLike, ArrayLike]
 """Vertices (V, 3) [m] and faces (F, 3)."""
@@ -124,12 +126,17 @@ def all_visible(
     """`visible` for several meshes that hide each other, at the cost of one. Raises `MeshError` as `visible` does."""
     if not meshes:
         return []
-    points, faces, buffer, ends = _draw(meshes, camera.scaled(min(camera.width, buffer_width)))
+    points, faces, buffer, ends = _draw(meshes, _buffered(camera, buffer_width))
     seen = np.zeros(len(points), np.bool_)
     output = wp.array(seen, dtype=wp.bool, device="cpu", copy=False)
     inputs = [points, faces, NEAR, TOLERANCE, buffer]
     wp.launch(kernels.visible_kernel, len(seen), inputs, [output], device="cpu")
     return np.split(seen, ends[:-1])
+
+
+def _buffered(camera: PinholeCamera, width: int) -> PinholeCamera:
+    """The camera at the resolution of the depth buffer, however tall its picture is."""
+    return camera.scaled(min(camera.width, width, max(_TALLEST * width * camera.width // camera.height, 1)))
 
 
 def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.float32]:

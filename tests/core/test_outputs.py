@@ -32,6 +32,7 @@ from refu_core.outputs import (
     depth_image,
     visible,
 )
+from refu_core.outputs._visible import BUFFER_WIDTH, _buffered
 from refu_lab.stress._frames import everyday_pose
 
 GARMENTS = ["tshirt-male", "short-pant-male"]
@@ -364,6 +365,17 @@ def test_visible_agrees_with_rays(pipeline: GarmentPipeline) -> None:
     assert 0.2 < true.mean() < 0.8
     assert (np.concatenate(seen)[rows] == true).mean() >= 0.96
     assert (visible(*meshes[0], camera, meshes[1:], buffer_width=640) == seen[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "columns", "rows"),
+    [(640, 480, 480, 360), (1080, 1920, 480, 853), (480, 32768, 28, 1911), (1, 32768, 1, 32768), (32768, 1, 480, 1)],
+)
+def test_no_picture_makes_a_huge_depth_buffer(width: int, height: int, columns: int, rows: int) -> None:
+    """A camera of 480 x 32,768 pixels, as anybody can publish, held up the node by a second for each frame."""
+    camera = PinholeCamera.looking_at([0, 0, 0], [0, 0, 4], width=width, height=height)
+    drawn = _buffered(camera, BUFFER_WIDTH)
+    assert (drawn.width, drawn.height) == (columns, rows)
 
 
 def test_what_is_seen_of_two_squares() -> None:

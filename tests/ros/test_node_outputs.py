@@ -403,6 +403,27 @@ def test_without_transforms_the_frame_is_warned_of(
     scene.until(warned, "as long as that lasts, the diagnostics warn of it")
 
 
+def test_a_cameras_frame_is_written_to_the_log_without_its_control_characters(
+    robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "tf2_msgs", None)
+    scene = robot(garments=[TSHIRT], camera_info="camera_info")
+    scene.hear("points", PointCloud2)
+    said, publisher = "", scene.peer.node.create_publisher(CameraInfo, "camera_info", 1)
+    camera = CameraInfo(width=640, height=480, k=[500.0, 0, 320, 0, 500, 240, 0, 0, 1])
+    camera.header.frame_id = "eye\x1b[2J"
+
+    def warned() -> bool:
+        nonlocal said
+        publisher.publish(camera)
+        said += capfd.readouterr().err
+        return "if they are the same place" in said
+
+    scene.until(warned, "it is warned of", timeout=20)
+    assert "\x1b" not in said
+    assert "eye\\x1b[2J" in said
+
+
 def test_an_input_waits_for_its_transform(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
     """Nobody is where they aren't: not before there are transforms, nor where a camera was before it moved."""
     kind = foreign("tf2_msgs/msg/TFMessage")

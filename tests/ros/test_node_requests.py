@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
 from harness import GARMENTS, PATIENCE_S, ROOT, NodeProcess, Peer, frame, ros_arguments
 from rclpy.action import ActionClient
 from scipy.spatial.transform import Rotation
@@ -23,7 +24,7 @@ import msg_adapters as adapters
 from msg_adapters import BagReader, BagWriter
 from msg_adapters.axes import SMPL_COLUMNS
 from refu_core import GarmentPipeline, RefuError, SmplFrame
-from refu_ros._beside import BagJob
+from refu_ros._beside import BagJob, RequestDresser
 from refu_ros._node import GarmentNode
 from refu_ros._requests import _fill
 from refu_ros._settings import NodeSettings
@@ -98,6 +99,16 @@ class Replayer:
             (message.feedback.frames_done, message.feedback.frames_total)
         )
         return self._done(self._client.send_goal_async(self._type.Goal(**goal), feedback_callback=told))
+
+    def begin_and_cancel(self, **goal: Any) -> Any:
+        """The handle of a goal that is cancelled, with all others, before the node has said that it accepts it."""
+        cancel = self._peer.node.create_client(CancelGoal, "garment_node/replay_bag/_action/cancel_goal")
+        self._peer.spin_until(cancel.service_is_ready, "goals can be cancelled")
+        begun, asked = self._client.send_goal_async(self._type.Goal(**goal)), cancel.call_async(CancelGoal.Request())
+        handle = self._done(begun)
+        if not self._done(asked).goals_canceling:  # the request has overtaken the goal
+            self.cancel(handle)
+        return handle
 
     def result(self, handle: Any) -> tuple[int, Any]:
         """Status and result."""
@@ -236,6 +247,17 @@ def test_a_recording_says_where_it_is(peer: Peer, bags: Path) -> None:
     assert not record(start=False).success
 
 
+def test_requests_that_wait_when_the_node_ends_are_told_so() -> None:
+    dresser, settings = RequestDresser(), NodeSettings(garments=GARMENTS[:1], backbone="skinned", sdf="none")
+    waiting = [dresser.ask(frame(i), settings, lambda *_: None) for i in range(3)]
+    dresser.close()
+    with pytest.raises(RefuError, match="shut down or failed before"):
+        waiting[-1].result()
+    again = dresser.ask(frame(1), settings, lambda output, _: output)
+    assert GARMENTS[0] in again.result()
+    dresser.close()
+
+
 def test_a_bag_is_dressed_beside_the_stream(peer: Peer, bags: Path) -> None:
     replayer = Replayer(peer)
     handle = replayer.begin(bag="two.mcap", topic="/bob/smpl_params", garments=GARMENTS[:1])
@@ -286,6 +308,9 @@ def test_one_bag_at_a_time_and_it_can_be_cancelled(peer: Peer, bags: Path) -> No
     assert 0 < result.frames < 20_000
     with BagReader(result.output) as bag:
         assert not bag.truncated
+    status, result = replayer.result(replayer.begin_and_cancel(bag="endless.mcap", garments=GARMENTS[:1], sdf="none"))
+    assert (status, result.output) == (GoalStatus.STATUS_CANCELED, "")
+    assert "before a frame was done" in result.message
 
 
 def test_a_bag_that_is_cancelled_before_its_first_frame_has_no_figures() -> None:
