@@ -30,19 +30,35 @@ _KINDS = {
 }
 
 
+class _Sized(io.FileIO):
+    """A file that ends at its size when it was opened, even if it grows."""
+
+    size = 0
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        """Fills the buffer, up to the file's end."""
+        return super().readinto(memoryview(buffer)[: max(0, self.size - self.tell())])
+
+
 class InputFile(io.BufferedReader):
     """A file of `size` bytes: no more than that is read even if it grows, and no memory is reserved for more."""
 
-    def __init__(self, raw: io.FileIO, size: int) -> None:
+    def __init__(self, raw: _Sized, size: int) -> None:
         super().__init__(raw)
-        self.size = size
+        self.size = raw.size = size
         self.step = size
         """The most that one `read` returns [bytes]; to a caller that asks for more, the file seems to be cut short."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         """At most `size` bytes."""
+        if size is not None and 0 <= size <= _SHORT:  # a pickle has a million reads of one byte
+            return super().read(size)
         most = max(0, min(self.size - self.tell(), self.step))
         return super().read(most if size is None or size < 0 else min(size, most))
+
+
+_SHORT = 256
+"""A read of so few bytes reserves next to no memory [bytes]."""
 
 
 def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError], wanted: str) -> InputFile:
@@ -55,7 +71,7 @@ def open_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
         got = _fault(Path(path).stat(), most)
         if not got:
             # Another file may have taken its place by now, so the opened one is checked again; opening it can't block.
-            raw = io.FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK | os.O_NOCTTY))
+            raw = _Sized(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK | os.O_NOCTTY))
             found = os.fstat(raw.fileno())
             got = _fault(found, most)
             if not got:
