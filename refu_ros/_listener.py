@@ -162,7 +162,7 @@ class Listener:
         requests would wait behind those of everybody: for seconds, where a crowd's come faster than they are followed.
         """
         node = self._node
-        if self.scene is None:
+        if self.scene is None or person not in self._inputs:  # the executor had taken it before nobody listened
             return
         node.statistics.receive()
         node.recording.put(topic, self.stream.message_type, data, INPUT_QOS)

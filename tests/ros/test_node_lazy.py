@@ -42,6 +42,7 @@ class Stage:
         self._executor = make_executor()
         self._executor.add_node(self.node)
         assert garment_node.started(self.node)
+        self.until(lambda: not self.node._count_namesakes(), "the node of the test before is gone")
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
         """Fails with `what` when it doesn't come true."""
@@ -170,6 +171,18 @@ def test_rest_is_reported_and_is_no_fault(stage: Callable[..., Stage], monkeypat
     monkeypatch.setattr("refu_ros._diagnostics._FIRST_INPUT_S", 2.0)
     scene.until(lambda: scene.peer.status("input")[0] == 1, "who doesn't send though somebody listens is missed")
     assert scene.peer.status("input")[2]["subscribed"] == "yes"
+
+
+def test_a_message_that_the_executor_has_taken_before_nobody_listened_is_left_out(stage: Callable[..., Stage]) -> None:
+    """It waited for a turn that never came: the node tried again and again, as fast as it could."""
+    scene = stage()
+    scene.peer.watch()
+    scene.dresses()
+    take = scene.node._listener._inputs[""].callback
+    scene.peer.unwatch()
+    scene.rests()
+    take(b"")
+    assert not scene.node._listener._turns
 
 
 def test_bodies_alone_are_a_reason_to_listen(stage: Callable[..., Stage]) -> None:
