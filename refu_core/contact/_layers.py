@@ -79,6 +79,7 @@ class Layer:
                 self._below.take(below)
             self._given.copy_(above)
             self._below.fit()
+            self._below.point_out()
             self._count.zero_()
             self._commands["look again" if goes_on else "look"].launch()
             self._commands["lift"].launch()

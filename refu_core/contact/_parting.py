@@ -70,6 +70,7 @@ class Parting:
 
         This leaves only the vertices that it moved last marked, so a second call needs another `find`.
         """
+        self._sheet.point_out()
         with torch_stream(self._device):
             self._points.copy_(above)
             self._ways[1].zero_()

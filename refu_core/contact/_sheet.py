@@ -15,7 +15,7 @@ from refu_core.mesh import Connectivity
 
 
 class Sheet:
-    """A mesh as kernels read it: its places, normals, box and tree. The tree is fitted when it is asked for."""
+    """A mesh as kernels read it: places, box, normals and tree. The last two follow a pose when they are asked for."""
 
     def __init__(self, mesh: Connectivity, rest: Tensor) -> None:
         """For a mesh with vertices (U, 3) [m] in the rest pose."""
@@ -25,31 +25,37 @@ class Sheet:
         self._normals = torch.empty_like(self.vertices)
         self._extent = memory(2, 3, device=rest.device)
         self.data = data = kernels.Below()
-        """The mesh as kernels read it; `fit` its tree first."""
+        """The mesh as kernels read it; `fit` its tree and `point_out` its normals before they are needed."""
         data.points, data.normals, data.extent = (
             as_warp(tensor, wp.vec3) for tensor in (self.vertices, self._normals, self._extent)
         )
         data.cut = cut_of(mesh, rest.device)
         self._tree = wp.Mesh(data.points, data.cut.faces.flatten())
         data.tree = self._tree.id
-        self._is_late = True
+        self._has_late_tree = self._has_late_normals = True
         arrays = [data.points, data.cut, data.normals]
-        self._point_out = recorded(kernels.normals_kernel, len(self.vertices), arrays, rest.device)
+        self._normals_of = recorded(kernels.normals_kernel, len(self.vertices), arrays, rest.device)
 
     def take(self, vertices: Tensor) -> None:
         """Takes over a pose, (U, 3) [m]."""
         with torch_stream(self.vertices.device):
             self.vertices.copy_(vertices)
             torch.aminmax(self.vertices, dim=0, out=(self._extent[0], self._extent[1]))
-            self._point_out.launch()
-        self._is_late = True
+        self._has_late_tree = self._has_late_normals = True
 
     def fit(self) -> None:
         """Fits the tree to the pose, once."""
-        if self._is_late:
+        if self._has_late_tree:
             with torch_stream(self.vertices.device):
                 self._tree.refit()
-            self._is_late = False
+            self._has_late_tree = False
+
+    def point_out(self) -> None:
+        """Computes the pose's normals, once."""
+        if self._has_late_normals:
+            with torch_stream(self.vertices.device):
+                self._normals_of.launch()
+            self._has_late_normals = False
 
 
 def cut_of(mesh: Connectivity, device: torch.device) -> Any:
