@@ -4,7 +4,7 @@
     python benchmarks/places.py --numbers    # the same with each of its numbers halved and doubled, in hours
 
 Meshes are built-in garments as somebody else may have modelled them: on arms that hang, spread legs or bent elbows, for
-a taller or shorter wearer, in any unit, axes and place, and coarser. A place is right if it is the first of
+a taller or shorter wearer, in any unit, axes and place. A place is right if it is the first of
 `find_places` with the unit, the way up, the front and the arms that the mesh was made with.
 """
 
