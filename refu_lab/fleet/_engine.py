@@ -13,6 +13,7 @@ import os
 import pickle
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -106,6 +107,22 @@ def _ctrl_c_waits() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def _ctrl_c_comes_later() -> Iterator[None]:
+    """Holds an interrupt back until the end of the block: raised in a destructor, it would be lost."""
+    if threading.current_thread() is not threading.main_thread():  # which alone is interrupted
+        yield
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
+
+
 class DaskEngine:
     """Runs tasks on a client's workers."""
 
@@ -137,13 +154,16 @@ class DaskEngine:
         waiting = iter(range(len(tasks)))
         window = IN_FLIGHT * max(1, sum(self.client.nthreads().values()))
         done = as_completed([submit(index) for index in islice(waiting, window)], loop=self.client.loop)
-        for future in done:
-            index = numbers.pop(future)
+        while numbers:
+            future = next(done)
             result = self._result(future)
-            future.release()
-            following = next(waiting, None)
-            if following is not None:
-                done.add(submit(following))
+            with _ctrl_c_comes_later():
+                index = numbers.pop(future)
+                future.release()
+                del future
+                following = next(waiting, None)
+                if following is not None:
+                    done.add(submit(following))
             yield index, result
 
     def _result(self, future: Future[Any]) -> Any:

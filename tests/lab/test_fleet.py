@@ -399,9 +399,17 @@ def test_killed_workers_lose_and_double_nothing(
     assert "Traceback" not in printed.err
 
 
-def test_ctrl_c_ends_the_processes_in_silence() -> None:
+IN_A_DESTRUCTOR = (
+    "import signal; from distributed import Future\n"
+    "def once(future, then=Future.__del__): Future.__del__ = then; signal.raise_signal(signal.SIGINT); then(future)\n"
+    "Future.__del__ = once\n"
+)
+
+
+@pytest.mark.parametrize("first", ["", IN_A_DESTRUCTOR], ids=["any time", "in a destructor"])
+def test_ctrl_c_ends_the_processes_in_silence(first: str) -> None:
     pytest.importorskip("distributed")
-    code = (
+    code = first + (
         "import time; from refu_lab.fleet._engine import open_engine, run_function\n"
         "with open_engine(2) as engine:\n"
         "    try:\n"
@@ -411,8 +419,9 @@ def test_ctrl_c_ends_the_processes_in_silence() -> None:
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True) as process:
         assert process.stdout is not None
-        assert process.stdout.readline() == b"up\n"
-        os.killpg(process.pid, signal.SIGINT)  # to all of them, as a terminal does
+        if not first:
+            assert process.stdout.readline() == b"up\n"
+            os.killpg(process.pid, signal.SIGINT)  # to all of them, as a terminal does
         out, error = process.communicate()
     assert (out.removeprefix(b"up\n"), error, process.returncode) == (b"interrupted\n", b"", 0)
 
