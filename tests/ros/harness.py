@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import fcntl
 import functools
+import gc
 import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +29,9 @@ from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import Marker, decode_marker_array, encoder_for
 from refu_core import SmplFrame
+from refu_ros import garment_node
+from refu_ros._node import GarmentNode
+from refu_ros._program import make_executor
 from tests.ros.ready import Forked, run_program
 
 if TYPE_CHECKING:
@@ -41,6 +46,8 @@ PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
 
+_QUIET_S = 0.03
+"""After so long without anything to do an executor has nothing left to do."""
 _LAST_WORDS_S = 20.0
 """A node that is told to end is killed after this time."""
 
@@ -235,6 +242,42 @@ class Peer:
     def close(self) -> None:
         """Leaves the graph."""
         self.node.destroy_node()
+
+
+class NodeHere:
+    """A node in this process, and a peer that doesn't watch yet; both move when the test waits."""
+
+    def __init__(self, *persons: str, executor: Any = None, **parameters: Any) -> None:
+        self.node = GarmentNode(cli_args=ros_arguments(parameters))
+        self.peer = Peer(*persons)
+        self.peer.unwatch()
+        self._executor = executor or make_executor()
+        self._executor.add_node(self.node)
+        assert garment_node.started(self.node)
+
+    def until(self, condition: Callable[[], Any], what: str, **options: Any) -> None:
+        """Fails with `what` when it doesn't come true."""
+
+        def both() -> Any:
+            self._executor.spin_once(timeout_sec=0.02)
+            return condition()
+
+        self.peer.spin_until(both, what, **options)
+
+    def close(self) -> None:
+        """Leaves the graph; fails if something still holds the node, which the next test would meet there."""
+        self.peer.close()
+        begun = time.monotonic()
+        while time.monotonic() < begun + _QUIET_S:  # rclpy's executor never frees what it hasn't come to, nor the node
+            begun = time.monotonic()
+            self._executor.spin_once(timeout_sec=_QUIET_S)
+        self._executor.remove_node(self.node)
+        self.node.close()
+        self.node.destroy_node()
+        node = weakref.ref(self.node)
+        del self.node, self._executor
+        gc.collect()  # only then is the node gone from the graph
+        assert node() is None
 
 
 def frame(i: int, *, stamp_ns: int | None = None, transl: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SmplFrame:

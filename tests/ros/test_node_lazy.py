@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import CHEAP, GARMENTS, ROOT, NodeProcess, Peer, frame, ros_arguments
+from harness import CHEAP, GARMENTS, ROOT, NodeHere, NodeProcess, Peer, frame
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -22,8 +22,6 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters import BagReader
-from refu_ros import garment_node
-from refu_ros._node import GarmentNode
 from refu_ros._program import make_executor
 
 if TYPE_CHECKING:
@@ -32,26 +30,11 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 
 
-class Stage:
-    """A node in this process, which forgets at once who has gone, and a peer; both move when the test waits."""
+class Stage(NodeHere):
+    """A node in this process, which forgets at once who has gone, and a peer."""
 
     def __init__(self, make_executor: Callable[[], Any], **parameters: Any) -> None:
-        self.node = GarmentNode(cli_args=ros_arguments(CHEAP | parameters))
-        self.peer = Peer()
-        self.peer.unwatch()
-        self._executor = make_executor()
-        self._executor.add_node(self.node)
-        assert garment_node.started(self.node)
-        self.until(lambda: not self.node._count_namesakes(), "the node of the test before is gone")
-
-    def until(self, condition: Callable[[], Any], what: str) -> None:
-        """Fails with `what` when it doesn't come true."""
-
-        def both() -> Any:
-            self._executor.spin_once(timeout_sec=0.02)
-            return condition()
-
-        self.peer.spin_until(both, what)
+        super().__init__(executor=make_executor(), **(CHEAP | parameters))
 
     def heard(self) -> int:
         """How many subscriptions the sender has."""
@@ -77,14 +60,6 @@ class Stage:
         self.until(lambda: len(self.peer.diagnostics) >= times, "the node says how it is")
         return self.peer.status("input")
 
-    def close(self) -> None:
-        self._executor.remove_node(self.node)
-        self.node.close()
-        self.node.destroy_node()
-        self.peer.close()
-        del self.node, self._executor
-        gc.collect()  # only then is the node gone from the graph
-
 
 @pytest.fixture
 def stage(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Stage]]:  # noqa: ARG001
@@ -94,8 +69,10 @@ def stage(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., 
     made: list[Stage] = []
 
     def make(make_executor: Callable[[], Any] = make_executor, **parameters: Any) -> Stage:
-        made.append(Stage(make_executor, **parameters))
-        return made[-1]
+        gc.collect()  # nodes of other tests that nothing holds
+        made.append(one := Stage(make_executor, **parameters))
+        one.until(lambda: not one.node._count_namesakes(), "programs of the tests before are gone")
+        return one
 
     yield make
     for one in made:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import shutil
 import signal
@@ -20,7 +19,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from geometry_msgs.msg import PolygonStamped, PoseStamped
-from harness import GARMENTS, PATIENCE_S, ROOT, Peer, frame, ros_arguments
+from harness import GARMENTS, PATIENCE_S, ROOT, NodeHere, Peer, frame
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -45,40 +44,23 @@ from msg_adapters.outputs import COLLISION_OBJECT, SCENE_UPDATE
 from msg_adapters.transforms import Transform, encode_transforms
 from refu_core import GarmentPipeline, SmplFrame, load_garment
 from refu_core.outputs import Openings
-from refu_ros import garment_node
-from refu_ros._node import GarmentNode
-from refu_ros._program import make_executor
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 PLAIN = {"input_type": "joint_state", "garments": [*GARMENTS], "backbone": "skinned", "sdf": "none"}
 TSHIRT = GARMENTS[0]
 
 
-class Robot:
-    """A node in this process, and a peer that hears what is asked for; both move when the test waits."""
+class Robot(NodeHere):
+    """A node in this process, and a peer that hears what is asked for."""
 
     def __init__(self, *persons: str, **parameters: Any) -> None:
-        self.node = GarmentNode(cli_args=ros_arguments(PLAIN | parameters))
-        self.peer = Peer(*persons)
-        self.peer.unwatch()
+        super().__init__(*persons, **(PLAIN | parameters))
         self.heard: dict[str, list[Any]] = {}
-        self._executor = make_executor()
-        self._executor.add_node(self.node)
-        assert garment_node.started(self.node)
 
     def hear(self, topic: str, kind: Any, *, raw: bool = False) -> Any:
         """Subscribes; what comes is in `heard`."""
         came: list[Any] = self.heard.setdefault(topic, [])
         return self.peer.node.create_subscription(kind, topic, came.append, 10, raw=raw)
-
-    def until(self, condition: Callable[[], Any], what: str, **options: Any) -> None:
-        """Fails with `what` when it doesn't come true."""
-
-        def both() -> Any:
-            self._executor.spin_once(timeout_sec=0.02)
-            return condition()
-
-        self.peer.spin_until(both, what, **options)
 
     def sends(self, sent: SmplFrame, *topics: str, person: str = "", data: bytes | None = None) -> None:
         """Until each topic has brought something of it."""
@@ -90,14 +72,6 @@ class Robot:
             return all(self.heard[topic] and _is_of(self.heard[topic][-1], sent) for topic in topics)
 
         self.until(came, f"{topics} come")
-
-    def close(self) -> None:
-        self._executor.remove_node(self.node)
-        self.node.close()
-        self.node.destroy_node()
-        self.peer.close()
-        del self.node, self._executor
-        gc.collect()
 
 
 def _is_of(message: Any, sent: SmplFrame) -> bool:
