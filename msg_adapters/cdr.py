@@ -73,11 +73,12 @@ class CdrReader:
 
     def skip(self, n_bytes: int) -> memoryview:
         """The next `n_bytes`, as a view."""
-        if not 0 <= n_bytes <= self.remaining:
+        end = self._at + n_bytes
+        if not self._at <= end <= len(self._data):
             msg = f"wanted {n_bytes} more bytes at byte {self._at}, the message has {max(self.remaining, 0)}"
             raise DecodeError(msg)
-        view = self._data[self._at : self._at + n_bytes]
-        self._at += n_bytes
+        view = self._data[self._at : end]
+        self._at = end
         return view
 
     def fields(self, codes: str) -> tuple[Any, ...]:
@@ -89,19 +90,23 @@ class CdrReader:
             elif code == "T":
                 values.append(self.stamp_ns())
             else:
-                primitive = _PRIMITIVES[self._order + code]
-                self.align(primitive.size)
-                values.append(primitive.unpack(self.skip(primitive.size))[0])
+                values.append(self._primitive(code))
         return tuple(values)
+
+    def _primitive(self, code: str) -> Any:
+        primitive = _PRIMITIVES[self._order + code]
+        size = primitive.size
+        self._at += (HEADER_BYTES - self._at) % size
+        return primitive.unpack(self.skip(size))[0]
 
     def length(self, *, item_bytes: int) -> int:
         """Length of a sequence whose items take at least `item_bytes` each."""
-        (count,) = self.fields("I")
+        count: int = self._primitive("I")
         if count * item_bytes > self.remaining:
             raise DecodeError(
                 f"a sequence claims {count} items of at least {item_bytes} bytes, the message has {self.remaining} left"
             )
-        return int(count)
+        return count
 
     def items(self, *, item_bytes: int) -> range:
         """A number for each item of a sequence that is read item by item."""
@@ -135,8 +140,9 @@ class CdrReader:
 
     def stamp_ns(self) -> int:
         """builtin_interfaces/Time (or Duration) in nanoseconds."""
-        seconds, nanoseconds = self.fields("iI")
-        return int(seconds) * NS_PER_S + int(nanoseconds)
+        seconds: int = self._primitive("i")
+        nanoseconds: int = self._primitive("I")
+        return seconds * NS_PER_S + nanoseconds
 
     def finish(self) -> None:
         """Check that the message ends here, apart from a few bytes of padding."""

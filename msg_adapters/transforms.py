@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
@@ -69,12 +70,16 @@ def encode_transforms(transforms: Sequence[Transform]) -> bytes:
 
 def decode_transforms(data: Buffer) -> list[Transform]:
     """The transforms of a `tf2_msgs/TFMessage`. Raises `DecodeError` for anything that isn't one."""
+    return [Transform(*header, numbers[:3], numbers[3:]) for header, numbers in _read(data)]
+
+
+def _read(data: Buffer) -> list[tuple[tuple[int, str, str], NDArray[np.float64]]]:
+    """Stamps [ns], parents and children, and with each translation [m] and quaternion, shape (7,)."""
     reader = CdrReader(data)
-    found = []
+    found: list[tuple[tuple[int, str, str], NDArray[np.float64]]] = []
     for _ in reader.items(item_bytes=_MIN_TRANSFORM_BYTES):
         stamp_ns, parent, child = reader.fields("Tss")
-        numbers = reader.array("f8", 7)
-        found.append(Transform(stamp_ns, parent, child, numbers[:3], numbers[3:]))
+        found.append(((stamp_ns, parent, child), reader.array("f8", 7)))
     reader.finish()
     return found
 
@@ -174,32 +179,38 @@ class TransformBuffer:
 
         Raises `DecodeError` for anything that isn't such a message.
         """
-        transforms, now = decode_transforms(data), self._clock()
+        transforms, now = _read(data), self._clock()
         if now >= self._forget_at:
             self._tracks = {name: one for name, one in self._tracks.items() if one.is_static or name in self._heard}
             self._heard, self._forget_at = set(), now + 1e-9 * HISTORY_NS
-        refused = ((one, self._take(one, is_static)) for one in transforms)
-        return [f"{one.child!r} in {one.parent!r}, {why}" for one, why in refused if why]
+        values = np.array([numbers for _, numbers in transforms], np.float64).reshape(-1, 7)
+        values[~(np.abs(values) <= PLAUSIBLE_TRANSL).all(1)] = np.nan
+        lengths = np.linalg.norm(values[:, 3:], axis=1)
+        values[:, 3:] /= np.where(lengths == 0, 1, lengths)[:, None]
+        refused = []
+        for ((stamp_ns, parent, child), _), value, length in zip(transforms, values, lengths.tolist(), strict=True):
+            if why := self._take(stamp_ns, parent.lstrip("/"), child.lstrip("/"), value, length, is_static):
+                refused.append(f"{child!r} in {parent!r}, {why}")
+        return refused
 
-    def _take(self, one: Transform, is_static: bool) -> str:
-        """Takes a transform, or returns why not."""
-        parent, child = one.parent.lstrip("/"), one.child.lstrip("/")
-        value = np.concatenate([np.asarray(one.translation, np.float64), np.asarray(one.quaternion, np.float64)])
+    def _take(
+        self, stamp_ns: int, parent: str, child: str, value: NDArray[np.float64], length: float, is_static: bool
+    ) -> str:
+        """Takes a transform whose quaternion had a `length`, NaN where a number isn't plausible, or returns why not."""
         if not parent or not child or parent == child:
             return "which aren't two frames"
         if max(len(parent), len(child)) > _LONGEST_NAME:
             return f"whose names are longer than {_LONGEST_NAME} characters"
-        if not (np.abs(value) <= PLAUSIBLE_TRANSL).all():
+        if math.isnan(length):
             return f"which has numbers that aren't finite or beyond {PLAUSIBLE_TRANSL:g}"
-        if abs((length := float(np.linalg.norm(value[3:]))) - 1.0) > _UNIT_TOLERANCE:
+        if abs(length - 1.0) > _UNIT_TOLERANCE:
             return f"which is no rotation: wanted a quaternion of length 1, got {length:.3g}"
         if child not in self._tracks and self.is_full:
             return f"which would be more than {len(self)} frames"
-        value[3:] /= length
         track = self._tracks.get(child)
         if track is None or track.parent != parent or track.is_static != is_static:
             track = self._tracks[child] = _Track(parent, is_static)
-        track.put(one.stamp_ns, value, most=min(_MOST_OWN, _MOST_STAMPS // len(self)))
+        track.put(stamp_ns, value.copy(), most=min(_MOST_OWN, _MOST_STAMPS // len(self)))
         self._heard.add(child)
         return ""
 
