@@ -177,7 +177,7 @@ class ContactStage:
         vertices, start = self.own_side(name, vertices, on_mean, margin + ASKED_FROM)
         pressed = pressed + (vertices - given)
         assert start.face is not None  # these distances are to faces
-        n_clipped = (start.face < 0).sum()
+        n_clipped = torch.count_nonzero(start.face < 0)
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         numbers, kept = done.numbers, margin

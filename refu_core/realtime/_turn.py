@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from refu_core.body import rotvec_to_rotmat
 
@@ -40,7 +41,7 @@ class RootTurn:
 
     def __call__(self, points: Tensor) -> Tensor:
         """Points [m], shape (N, 3), from the root's axes to the world's."""
-        return torch.addmm(self.shift, points, self.rotation.T)
+        return functional.linear(points, self.rotation, self.shift)
 
     def to_host(self, points: Tensor) -> NDArray[np.float32]:
         """The same, as an array on the host."""
