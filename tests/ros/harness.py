@@ -46,7 +46,7 @@ PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
 
-_QUIET_S = 0.03
+_QUIET_S = 0.05
 """After so long without anything to do an executor has nothing left to do."""
 _LAST_WORDS_S = 20.0
 """A node that is told to end is killed after this time."""
