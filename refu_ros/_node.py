@@ -71,7 +71,11 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
         self._requests = Requests(self)
         self.add_on_set_parameters_callback(self._on_parameters)
-        self.create_timer(_BEAT_S, self.guarded("each second", self._on_second), clock=steady)
+        for beat in (
+            self._look_after,
+            self._report,
+        ):  # what can't be looked after must not keep the rest from being told
+            self.create_timer(_BEAT_S, self.guarded("each second", beat), clock=steady)
         if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
             self.create_timer(1 / self.settings.keypoint_rate, predict, clock=steady)
@@ -297,7 +301,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     # Once a second --------------------------------------------------------------------------------
 
-    def _on_second(self) -> None:
+    def _look_after(self) -> None:
+        """Notices what no event has told of."""
         self._take_back()
         self._attend()
         if self._worker is not None:
@@ -305,6 +310,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             for name, reason in [*self._worker.fittings.without_planner.items()]:  # a thread adds to them
                 text = f"planners aren't sent {name}: {printable(reason)}"
                 self.get_logger().warning(text, throttle_duration_sec=60.0)
+
+    def _report(self) -> None:
+        """Says how the node is."""
         report = self.statistics.report()
         recording, error = self.recording.state()
         scene, since = self._listener.scene, self._listener.since
@@ -336,7 +344,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _count_namesakes(self) -> int:
         """How many other nodes have this name: they answer each other's requests, and their topics mix."""
         own = (self.get_name(), self.get_namespace())
-        count = max(0, list(self.get_node_names_and_namespaces()).count(own) - 1)
+        names = self.guarded("names of nodes", self.get_node_names_and_namespaces, lambda _: [])  # a peer's isn't UTF-8
+        count = max(0, [*names()].count(own) - 1)
         if count:
             self.get_logger().warning(f"{count + 1} nodes are called {own[0]}", throttle_duration_sec=60.0)
         return count
