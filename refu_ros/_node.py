@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +57,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._state = "unconfigured"
         self._worker: Worker | None = None
         self._loader: PipelineLoader | None = None
+        self._loaded: deque[tuple[Fittings, PipelineOptions]] = deque(maxlen=1)
+        """What the loader has loaded and the executor's thread hasn't taken over yet."""
         self._fittings: Fittings | None = None
         self._in_use: PipelineOptions | None = None
         self._refused: PipelineOptions | None = None
@@ -98,11 +101,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         except RefuError as error:
             self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
-        self._loader = PipelineLoader(
-            lambda *new: self.executor.create_task(self._on_loaded, *new),  # the executor's thread takes it over
-            self._on_not_loaded,
-            threads=self.settings.threads,
-        )
+        self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded, threads=self.settings.threads)
         self._state = "inactive"
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
@@ -175,6 +174,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _cleanup(self) -> None:
         if self._loader is not None:
             self._loader.close()
+        self._loaded.clear()
         self._loader = self._fittings = self._in_use = None
         self._state = "unconfigured"
 
@@ -267,7 +267,15 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         for text in fittings.pipeline.warnings:
             self.get_logger().warning(text)
 
-    def _on_loaded(self, fittings: Fittings, key: PipelineOptions) -> None:
+    def _on_loaded(self, *new: Any) -> None:
+        self._loaded.append(new)
+        if (executor := self.executor) is not None:  # it has none before it spins, nor after
+            executor.create_task(self._take_over)
+
+    def _take_over(self) -> None:
+        if not self._loaded:
+            return
+        fittings, key = self._loaded.popleft()
         self._take(fittings, key)
         if self._worker is not None:
             self._worker.fittings = fittings
@@ -303,6 +311,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _look_after(self) -> None:
         """Notices what no event has told of."""
+        self._take_over()
         self._take_back()
         self._attend()
         if self._worker is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +85,25 @@ def test_who_has_left_a_tracker_is_forgotten(node: Any, monkeypatch: pytest.Monk
     assert len(listener._frames) == MOST_PEOPLE
     assert listener._frames[f"p{MOST_PEOPLE + 9}"] == "camera"  # who came first is forgotten
     assert "p9" not in listener._frames
+
+
+def test_what_is_loaded_while_nothing_spins_is_taken_over_later(node: Any) -> None:
+    """A device that fails before the first spin; and, at the end, loading was said to have failed."""
+
+    def load() -> None:
+        node._loader.request(wanted)
+        node._loader._pool.submit(bool).result()  # once that has been loaded
+
+    node.trigger_configure()
+    wanted = replace(node._pipeline_key, sdf="none")
+    load()
+    assert not node.statistics.report().last_error
+    node._look_after()
+    assert node._in_use == wanted
+    load()
+    node.trigger_cleanup()
+    node._look_after()
+    assert node._fittings is None
 
 
 def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
