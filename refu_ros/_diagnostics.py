@@ -96,6 +96,7 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
         (now.listening_for is None, OK, "not subscribed to: nobody listens to anything, and nothing is recorded"),
         (invalid and invalid == received, ERROR, f"every message is invalid: {reasons['invalid']}"),
         (invalid, WARN, f"{invalid} of {received} messages are invalid: {reasons['invalid']}"),
+        (n := recent["drop.stale_transforms"], WARN, f"{n} messages of transforms weren't read: too many come"),
         (n := recent["drop.transform"], WARN, f"{n} of {received} have no transform: {reasons['transform']}"),
         (n := recent["drop.crowd"], WARN, f"{n} frames of people beyond the first: {reasons['crowd']}"),
         (silent_for is None and waited > _FIRST_INPUT_S, WARN, "no input yet"),

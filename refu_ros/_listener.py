@@ -35,7 +35,10 @@ _HUMANS = re.compile(r"/humans/bodies/([A-Za-z][A-Za-z0-9_]{0,99})/joint_states"
 _TRACKED = "/humans/bodies/tracked"
 _GRACE_S = 5.0
 """How long the inputs stay subscribed to after the last viewer has left: many viewers are only restarted [s]."""
+_TF, _TF_STATIC = "/tf", "/tf_static"
 _TF_DEPTH = 100
+_TURN_S = 0.005
+"""How long transforms are taken before it is another's turn [s]: most messages are small, and there are many."""
 _RETRY_S = 0.02
 """How often it is looked whose wait for a transform is over, when neither inputs nor transforms come [s]."""
 
@@ -58,6 +61,9 @@ class Listener:
         self._inputs: dict[str, Any] = {}
         self._frames: dict[str, str] = {}
         self._tracked: set[str] | None = None
+        self._topics: list[Any] = []
+        """All that there were when they could last be named: rclpy can't while a peer has one that isn't UTF-8."""
+        self._name_topics = node.guarded("names of topics", node.get_topic_names_and_types, lambda _: self._topics)
         self._tf, self._waiting = adapters.TransformBuffer(), adapters.MessageFilter(node.statistics, most=self.room)
         self._tf_asked_at: float | None = None
         self.is_untransformed = False
@@ -162,13 +168,18 @@ class Listener:
         requests would wait behind those of everybody: for seconds, where a crowd's come faster than they are followed.
         """
         node = self._node
-        if self.scene is None or person not in self._inputs:  # the executor had taken it before nobody listened
+        if self.scene is None or person not in self._inputs:
             return
         node.statistics.receive()
         node.recording.put(topic, self.stream.message_type, data, INPUT_QOS)
-        waiting = self._turns.setdefault(person, deque(maxlen=INPUT_QOS.depth))
-        if len(waiting) == waiting.maxlen:
-            node.statistics.drop("stale")
+        self._queue(person, data, most=INPUT_QOS.depth, cause="stale")
+
+    def _queue(self, name: str, data: bytes, *, most: int, cause: str) -> None:
+        if name not in self._inputs:  # the executor had taken it before nobody listened
+            return
+        waiting = self._turns.setdefault(name, deque(maxlen=most))
+        if len(waiting) == most:
+            self._node.statistics.drop(cause)
         waiting.append(data)
         if self._next_turn.is_canceled():
             self._next_turn.reset()
@@ -176,12 +187,14 @@ class Listener:
     def _take_turn(self) -> None:
         """Works on the oldest message of whose turn it is; others of theirs wait until everybody has had a turn."""
         if self._turns:
-            person = next(iter(self._turns))
-            topic, waiting = self._inputs[person].topic_name, self._turns.pop(person)
-            data = waiting.popleft()
-            if waiting:
-                self._turns[person] = waiting
-            self._node.guarded(topic, self._on_input)(person, topic, data)
+            name = next(iter(self._turns))
+            topic, waiting = self._inputs[name].topic_name, self._turns.pop(name)
+            if name in (_TF, _TF_STATIC):
+                self._node.guarded(topic, self._on_transforms)(waiting, is_static=name == _TF_STATIC)
+            else:
+                self._node.guarded(topic, self._on_input)(name, topic, waiting.popleft())
+            if waiting and name in self._inputs:
+                self._turns[name] = waiting
         if not self._turns:
             self._next_turn.cancel()
 
@@ -277,14 +290,18 @@ class Listener:
         return differs
 
     def _listen_to_tf(self) -> None:
-        for topic, durability in (("/tf", DurabilityPolicy.VOLATILE), ("/tf_static", DurabilityPolicy.TRANSIENT_LOCAL)):
-            take = partial(self._on_transforms, topic == "/tf_static")
+        for topic, durability in ((_TF, DurabilityPolicy.VOLATILE), (_TF_STATIC, DurabilityPolicy.TRANSIENT_LOCAL)):
+            take = partial(self._queue, topic, most=_TF_DEPTH, cause="stale_transforms")
             self._hear(topic, adapters.TF_MESSAGE, topic, take, QoSProfile(depth=_TF_DEPTH, durability=durability))
         self._tf, self._tf_asked_at = adapters.TransformBuffer(), time.monotonic()
 
-    def _on_transforms(self, is_static: bool, data: bytes) -> None:
-        refused = self._tf.put(data, is_static=is_static)
-        self._place()
+    def _on_transforms(self, waiting: deque[bytes], *, is_static: bool) -> None:
+        refused, last = list[str](), time.monotonic() + _TURN_S
+        try:
+            while waiting and time.monotonic() < last:
+                refused += self._tf.put(waiting.popleft(), is_static=is_static)
+        finally:
+            self._place()
         if refused:
             raise RefuError(f"{len(refused)} transforms left out, the first: {refused[0]}")
 
@@ -292,8 +309,8 @@ class Listener:
 
     def _bodies(self) -> dict[str, str]:
         """The topic of each body that there is: of those announced as tracked, or of all if nothing is announced."""
-        names, count, tracked = self._node.get_topic_names_and_types(), self._node.count_publishers, self._tracked
-        found = ((match[1], topic) for topic, _ in names if (match := _HUMANS.fullmatch(topic)))
+        self._topics, count, tracked = self._name_topics(), self._node.count_publishers, self._tracked
+        found = ((match[1], topic) for topic, _ in self._topics if (match := _HUMANS.fullmatch(topic)))
         bodies = [one for one in found if (tracked is None or one[0] in tracked) and count(one[1])]
         if len(bodies) > self.room:
             self._node.statistics.drop("crowd", f"{len(bodies)} bodies, up to {self.room} are dressed")

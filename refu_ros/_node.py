@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +57,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._state = "unconfigured"
         self._worker: Worker | None = None
         self._loader: PipelineLoader | None = None
+        self._loaded: deque[tuple[Fittings, PipelineOptions]] = deque(maxlen=1)
+        """What the loader has loaded and the executor's thread hasn't taken over yet."""
         self._fittings: Fittings | None = None
         self._in_use: PipelineOptions | None = None
         self._refused: PipelineOptions | None = None
@@ -71,7 +74,11 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
         self._requests = Requests(self)
         self.add_on_set_parameters_callback(self._on_parameters)
-        self.create_timer(_BEAT_S, self.guarded("each second", self._on_second), clock=steady)
+        for beat in (
+            self._look_after,
+            self._report,
+        ):  # what can't be looked after must not keep the rest from being told
+            self.create_timer(_BEAT_S, self.guarded("each second", beat), clock=steady)
         if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
             self.create_timer(1 / self.settings.keypoint_rate, predict, clock=steady)
@@ -94,11 +101,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         except RefuError as error:
             self.get_logger().error(f"can't be configured: {printable(error)}")
             return TransitionCallbackReturn.FAILURE
-        self._loader = PipelineLoader(
-            lambda *new: self.executor.create_task(self._on_loaded, *new),  # the executor's thread takes it over
-            self._on_not_loaded,
-            threads=self.settings.threads,
-        )
+        self._loader = PipelineLoader(self._on_loaded, self._on_not_loaded, threads=self.settings.threads)
         self._state = "inactive"
         self.get_logger().info(f"configured with {self._in_use}")
         return super().on_configure(state)
@@ -171,6 +174,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _cleanup(self) -> None:
         if self._loader is not None:
             self._loader.close()
+        self._loaded.clear()
         self._loader = self._fittings = self._in_use = None
         self._state = "unconfigured"
 
@@ -263,7 +267,15 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         for text in fittings.pipeline.warnings:
             self.get_logger().warning(text)
 
-    def _on_loaded(self, fittings: Fittings, key: PipelineOptions) -> None:
+    def _on_loaded(self, *new: Any) -> None:
+        self._loaded.append(new)
+        if (executor := self.executor) is not None:  # it has none before it spins, nor after
+            executor.create_task(self._take_over)
+
+    def _take_over(self) -> None:
+        if not self._loaded:
+            return
+        fittings, key = self._loaded.popleft()
         self._take(fittings, key)
         if self._worker is not None:
             self._worker.fittings = fittings
@@ -297,7 +309,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     # Once a second --------------------------------------------------------------------------------
 
-    def _on_second(self) -> None:
+    def _look_after(self) -> None:
+        """Notices what no event has told of."""
+        self._take_over()
         self._take_back()
         self._attend()
         if self._worker is not None:
@@ -305,6 +319,9 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             for name, reason in [*self._worker.fittings.without_planner.items()]:  # a thread adds to them
                 text = f"planners aren't sent {name}: {printable(reason)}"
                 self.get_logger().warning(text, throttle_duration_sec=60.0)
+
+    def _report(self) -> None:
+        """Says how the node is."""
         report = self.statistics.report()
         recording, error = self.recording.state()
         scene, since = self._listener.scene, self._listener.since
@@ -336,7 +353,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _count_namesakes(self) -> int:
         """How many other nodes have this name: they answer each other's requests, and their topics mix."""
         own = (self.get_name(), self.get_namespace())
-        count = max(0, list(self.get_node_names_and_namespaces()).count(own) - 1)
+        names = self.guarded("names of nodes", self.get_node_names_and_namespaces, lambda _: [])  # a peer's isn't UTF-8
+        count = max(0, [*names()].count(own) - 1)
         if count:
             self.get_logger().warning(f"{count + 1} nodes are called {own[0]}", throttle_duration_sec=60.0)
         return count

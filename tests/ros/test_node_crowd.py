@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,8 +14,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
-from harness import CHEAP, NodeProcess, Peer
+import rclpy
+from harness import CHEAP, NodeHere, NodeProcess, Peer
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from rclpy.signals import SignalHandlerOptions
+from rmw_dds_common.msg import NodeEntitiesInfo, ParticipantEntitiesInfo
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
@@ -26,8 +34,7 @@ from refu_ros._node import GarmentNode
 from refu_ros._program import make_executor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+    from collections.abc import Callable, Iterator
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 BODY = "/humans/bodies/{}/joint_states"
@@ -80,6 +87,25 @@ def test_who_has_left_a_tracker_is_forgotten(node: Any, monkeypatch: pytest.Monk
     assert "p9" not in listener._frames
 
 
+def test_what_is_loaded_while_nothing_spins_is_taken_over_later(node: Any) -> None:
+    """A device that fails before the first spin; and, at the end, loading was said to have failed."""
+
+    def load() -> None:
+        node._loader.request(wanted)
+        node._loader._pool.submit(bool).result()  # once that has been loaded
+
+    node.trigger_configure()
+    wanted = replace(node._pipeline_key, sdf="none")
+    load()
+    assert not node.statistics.report().last_error
+    node._look_after()
+    assert node._in_use == wanted
+    load()
+    node.trigger_cleanup()
+    node._look_after()
+    assert node._fittings is None
+
+
 def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Timers and requests waited behind all messages that had come: twenty seconds, with a crowd's keypoints."""
     executor, done, listener = make_executor(), list[bytes | str](), node._listener
@@ -100,6 +126,79 @@ def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypat
     assert (report.total["received"], report.total["drop.stale"]) == (100, 100 - INPUT_QOS.depth)
     listener.unsubscribe()
     executor.remove_node(node)
+
+
+class _Qos(ctypes.Structure):
+    """`rmw_qos_profile_t`."""
+
+    _fields_ = (
+        ("history", ctypes.c_int),
+        ("depth", ctypes.c_size_t),
+        ("reliability", ctypes.c_int),
+        ("durability", ctypes.c_int),
+        ("deadline_and_lifespan", ctypes.c_uint64 * 4),
+        ("liveliness", ctypes.c_int),
+        ("lease", ctypes.c_uint64 * 2),
+        ("is_not_ros", ctypes.c_bool),
+    )
+
+
+class _Bytes(ctypes.Structure):
+    """`rmw_serialized_message_t`."""
+
+    _fields_ = (("data", ctypes.c_char_p), ("length", ctypes.c_size_t), ("room", ctypes.c_size_t * 6))
+
+
+@contextmanager
+def dds(peer: Any, kind: Any, topic: bytes) -> Iterator[Callable[[bytes], int]]:
+    """A publisher of the middleware alone, for which ROS's rules of names don't hold; yields its `publish`."""
+    files = [line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if ".so" in line]
+    loaded = {Path(file).name: file for file in files}
+    if "librmw_fastrtps_cpp.so" not in loaded:
+        pytest.skip("the middleware isn't Fast DDS")
+    rcl, rmw, python = ctypes.CDLL(loaded["librcl.so"]), ctypes.CDLL(loaded["librmw_fastrtps_cpp.so"]), ctypes.pythonapi
+    pointer, python.PyCapsule_GetName.restype = ctypes.c_void_p, ctypes.c_char_p
+    for function in (rcl.rcl_node_get_rmw_handle, rmw.rmw_create_publisher, python.PyCapsule_GetPointer):
+        function.restype = pointer
+    kind.__class__.__import_type_support__()
+    support = ctypes.py_object(kind.__class__._TYPE_SUPPORT)
+    support = pointer(python.PyCapsule_GetPointer(support, ctypes.c_char_p(python.PyCapsule_GetName(support))))
+    qos, nothing = _Qos(1, 1, 1, 1, liveliness=1, is_not_ros=True), (ctypes.c_uint64 * 8)()
+    with peer.handle:
+        own = pointer(rcl.rcl_node_get_rmw_handle(pointer(peer.handle.pointer)))
+        made = pointer(rmw.rmw_create_publisher(own, support, topic, ctypes.byref(qos), nothing))
+    assert made
+    try:
+        yield lambda data: rmw.rmw_publish_serialized_message(made, ctypes.byref(_Bytes(data, len(data))), None)
+    finally:
+        rmw.rmw_destroy_publisher(own, made)
+
+
+def test_names_that_are_no_text_silence_nobody(ros: None) -> None:  # noqa: ARG001
+    """rclpy names no node, or no topic, while one of them isn't UTF-8: diagnostics ended for good."""
+    scene, ann, context = NodeHere(**CHEAP, follow_humans=True), Peer("ann", topic=BODY), rclpy.Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
+    stranger = rclpy.create_node("stranger", context=context)  # what comes from its own process a node doesn't heed
+    info = ParticipantEntitiesInfo(node_entities_info_seq=[NodeEntitiesInfo(node_namespace="/", node_name="nobody")])
+    scene.until(ann.listeners, "ann is listened to")
+    with dds(stranger, ParticipantEntitiesInfo, b"ros_discovery_info") as announce:
+        with dds(stranger, JointState, b"rt/humans/bodies/\xff/joint_states"):
+            announce(serialize_message(info).replace(b"nobody", b"\xff" * 6))
+            wanted = {"faults: names of nodes", "faults: names of topics"}
+            scene.until(lambda: wanted <= scene.peer.status("node")[2].keys(), "it is said")
+            assert ann.listeners()
+        announce(serialize_message(ParticipantEntitiesInfo()))  # nothing else takes the name back
+
+        def readable() -> bool:
+            with suppress(UnicodeDecodeError):
+                return bool(scene.node.get_node_names() and scene.node.get_topic_names_and_types())
+            return False
+
+        scene.until(readable, "names can be read again")
+    stranger.destroy_node()
+    context.try_shutdown()
+    ann.close()
+    scene.close()
 
 
 def test_a_crowd_of_bodies_and_a_long_name_take_nothing_from_others(ros: None, tmp_path: Path) -> None:  # noqa: ARG001

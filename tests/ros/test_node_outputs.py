@@ -433,6 +433,27 @@ def test_an_input_waits_for_its_transform(robot: Callable[..., Robot], foreign: 
     assert scene.node.statistics.report().total["late_transform"] == 1
 
 
+def test_a_flood_of_transforms_leaves_others_a_turn(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
+    """Requests waited behind all that had come: for half a minute, where each message held ten thousand."""
+    foreign("tf2_msgs/msg/TFMessage")
+    scene = robot(garments=[TSHIRT], lazy=False)
+    listener, others = scene.node._listener, list[int]()
+    listener._listen_to_tf()
+    places = [Transform(10**9, "map", f"link_{i}", [0, 0, 0], [0, 0, 0, 1]) for i in range(1000)]
+    for _ in range(150):
+        listener._inputs["/tf"].callback(encode_transforms(places))
+    scene.node.executor.create_task(lambda: others.append(len(listener._turns["/tf"])))
+    scene.until(lambda: others, "others have their turn")
+    assert others[0] > 90
+    scene.until(lambda: "/tf" not in listener._turns, "they are taken")
+    assert len(listener._tf) == len(places)
+    assert scene.node.statistics.report().total["drop.stale_transforms"] == 50
+    take = listener._inputs["/tf"].callback
+    listener.unsubscribe()
+    take(encode_transforms(places))  # the executor had it already
+    assert not listener._turns
+
+
 def test_each_person_is_where_their_own_marker_is(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
     """Of two cameras, one at the origin of the map."""
     kind = foreign("tf2_msgs/msg/TFMessage")
