@@ -25,7 +25,7 @@ class Layer:
 
     The repulsion is ReFU's (paper, Eq. 2) with a sheet in the place of the body, which the paper doesn't treat: where
     the height f of a vertex over the sheet is less than the gap ε, x' = x - (f - ε) n, and neighbours give way. Unlike
-    a body, a sheet has no inside: only cloth that faces the way the sheet does belongs above it.
+    a body, a sheet has no inside: cloth that stands on it at a right angle may belong on either side, and stays.
 
     The search for the closest point goes downhill from the nearest of a few vertices around the one closest at rest, in
     half the time of a tree. A vertex that isn't near the sheet at rest (of a sleeve beside shorts) is a stranger, and

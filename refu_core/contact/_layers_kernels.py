@@ -222,7 +222,7 @@ def closest_of_all(p: wp.vec3, reach: float, below: Below) -> int:
 
 
 @wp.func
-def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rules: LayerRules) -> None:
+def lift_off(i: int, face: int, below: Below, above: Above, rules: LayerRules) -> None:
     """Stores the displacement that brings vertex i to the gap above its closest face of the sheet, if there is one."""
     if face < 0:
         return
@@ -232,10 +232,9 @@ def lift_off(i: int, face: int, faces_it: bool, below: Below, above: Above, rule
     far = wp.length(offset)
     if height >= rules.gap or far > rules.reach:
         return
-    agreement = wp.dot(normal_at(i, above.points, above.cut), normal)
-    # A stranger may also face the sheet from outside, like a sleeve that hangs beside shorts.
-    agreement = wp.where(faces_it, wp.abs(agreement), agreement)
-    share = wp.clamp(agreement / rules.alike, 0.0, 1.0)
+    # Cloth lies on the sheet and faces as it does, or faces it: a sleeve beside shorts, a hem in the crease of a hip.
+    agreement = wp.abs(wp.dot(normal_at(i, above.points, above.cut), normal))
+    share = wp.min(1.0, agreement / rules.alike)
     # Every influence fades out gradually; otherwise cloth would jump from frame to frame.
     share *= wp.min(1.0, 4.0 * (1.0 - far / rules.reach))
     if (below.cut.rim[face] >> feature) & 1 != 0:
@@ -262,7 +261,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
         v = int(above.found[i])
         if v == STRANGER:
             if is_within(p, below.extent, rules.gap):
-                lift_off(i, closest_of_all(p, rules.reach, below), True, below, above, rules)
+                lift_off(i, closest_of_all(p, rules.reach, below), below, above, rules)
             continue
         squared = wp.length_sq(below.points[v] - p)
         # A vertex this near is in the right fold.
@@ -283,7 +282,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
             is_low = wp.dot(offset, normal_on(face, w, below)) < rules.gap
             if is_low and wp.length(offset) > 0.5 * rules.reach:  # this may be another fold
                 face = closest_of_all(p, rules.reach, below)
-            lift_off(i, face, False, below, above, rules)
+            lift_off(i, face, below, above, rules)
 
 
 @wp.func

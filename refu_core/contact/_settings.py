@@ -56,9 +56,9 @@ class ContactSettings:
     limit of 1.4 it is 48 % of frames, with 1.25 it is 96 %; crossings and jumps stay as many."""
     alike: float = 0.5
     """Cosine from which on two sheets count in full as facing the same way; down to a right angle this fades to
-    nothing. A push off a garment below counts by that weight. By the same weight cloth that faces where skinning turns
-    it is left as it is; the rest has folded over, and is levelled. Of 20 frames that are all cut without levelling,
-    this leaves 2 cut; levelling only below 0.25 leaves 7."""
+    nothing. A push off a garment below counts by that weight, or by as much where the two face each other. By the same
+    weight cloth that faces where skinning turns it is left as it is; the rest has folded over, and is levelled. Of 20
+    frames that are all cut without levelling, this leaves 2 cut; levelling only below 0.25 leaves 7."""
     layer_margin: float = 0.5
     """Share of the body's margin that is kept after a garment was brought off those below it a second time. A push off
     the body may push a vertex into a layer, and the other way round; the rest of the margin is slack for both."""
