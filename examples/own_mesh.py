@@ -11,8 +11,9 @@ import numpy as np
 import torch
 import trimesh
 
-from refu_core import load_body
+from refu_core import RefuError, load_body
 from refu_core.contact import Resolver
+from refu_core.fitting import read_surface
 from refu_core.metrics import CollisionChecker
 from refu_core.sdf import ExactSdf
 
@@ -32,7 +33,7 @@ def main(path: str | None = None) -> tuple[int, int]:
     """Returns how many pairs of triangles of garment and body intersect, before and after."""
     body = load_body("male")
     skin = body(torch.zeros(1, 24, 3)).vertices[0]  # T-pose, SMPL axes: y up, the chest at the origin
-    garment = tube(0.14, -0.35, -0.05) if path is None else trimesh.load_mesh(path, process=False)
+    garment = tube(0.14, -0.35, -0.05) if path is None else read_surface(path)
     vertices = torch.tensor(garment.vertices, dtype=torch.float32)
     faces = torch.tensor(garment.faces)
 
@@ -50,4 +51,7 @@ def main(path: str | None = None) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    try:
+        main(*sys.argv[1:2])
+    except RefuError as error:
+        sys.exit(f"own_mesh.py: {error}")

@@ -66,6 +66,8 @@ def test_own_mesh_from_a_file(run, tmp_path: Path) -> None:
     before, after = numbers(r": (\d+) before, (\d+) after", run("own_mesh", "mine.obj"))
     assert before > 0
     assert after == 0
+    with pytest.raises(SystemExit, match=r"own_mesh.py: gone.obj: can't be read: No such file"):
+        run("own_mesh", "gone.obj")
 
 
 def test_refu_layer(run) -> None:

@@ -86,7 +86,7 @@ class BagReader:
             missing = f"no {METADATA_FILE} (was the recording interrupted?); its files are read by name"
             self._notes.append(f"{self.path}: {missing}")
         if not files:
-            raise BagError(f"{self.path}: no {' or '.join(BAG_SUFFIXES)} file in this directory")
+            raise BagError(f"{self.path}: no {' or '.join(BAG_SUFFIXES)} file in this directory; wanted {WANTED_FILE}")
         return files
 
     def _open(self, path: Path) -> McapFile | SqliteFile:
@@ -99,7 +99,8 @@ class BagReader:
         if start.startswith(MAGIC):
             return McapFile(path, report)
         hint = "convert it with `rosbags-convert`" if start.startswith(b"#ROSBAG") else f"wanted {WANTED_FILE}"
-        raise BagError(f"{path}: not an MCAP file; {hint}")
+        wanted = "SQLite" if path.suffix == ".db3" else "MCAP"
+        raise BagError(f"{path}: not an {wanted} file; {hint}")
 
     def _report(self, path: Path, damage: DamageError) -> None:
         self.truncated = True

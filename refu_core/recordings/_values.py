@@ -15,6 +15,7 @@ from refu_core.recordings._containers import Content
 
 GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
 _STEADY = 1e-3  # betas that differ by less between frames are one shape
+_SAY_IT = "say it, as in --fps 30 (in Python: fps=30)"
 
 
 def turned(place: NDArray[np.float64], roots: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -47,7 +48,7 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, has_age: b
     """
     betas = np.zeros(N_BETAS, np.float32)
     if array is None or not array.size:
-        notes.append("no betas: the mean shape")
+        notes.append("no betas: the mean shape, unless betas are given")
         return betas
     if array.dtype.kind not in "iuf" or array.ndim > 3 or (array.ndim > 1 and len(array) not in (1, n)):
         msg = f"betas must be one row of coefficients, or a row for each of {n} frames, got {array.dtype} {array.shape}"
@@ -72,7 +73,7 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, has_age: b
 def fps_of(content: Content, value: Any) -> float:
     """Frames a second. Raises `ValueError` if there is no such number."""
     if value is None:
-        raise ValueError("no frame rate in the file: say it, as in --fps 30 (in Python: fps=30)")
+        raise ValueError(f"no frame rate in the file: {_SAY_IT}")
     if type(value) in (int, float):
         return float(value)
     array = np.asarray(value) if isinstance(value, str) else content.array(value)
@@ -81,7 +82,8 @@ def fps_of(content: Content, value: Any) -> float:
     if array.size == 1 and array.dtype.kind in "US":
         with contextlib.suppress(ValueError):
             return float(word_of(content, array))
-    raise ValueError(f"no frame rate: {table.RATES[0]} must be one number, got {array.dtype} {array.shape}")
+    got = f"{table.RATES[0]} must be one number, got {array.dtype} {array.shape}"
+    raise ValueError(f"no frame rate: {got}; {_SAY_IT}")
 
 
 def word_of(content: Content, value: Any, which: int = 0) -> str:

@@ -63,16 +63,17 @@ def names(text: str) -> tuple[str, ...]:
     return found
 
 
-def numbers(count: int) -> Callable[[str], tuple[float, ...]]:
-    """A parser of `X,Y,...`: up to `count` numbers, the rest are zero."""
+def numbers(count: int, *, least: int = 1) -> Callable[[str], tuple[float, ...]]:
+    """A parser of `X,Y,...`: `least` to `count` numbers, the rest are zero."""
 
     def parse(text: str) -> tuple[float, ...]:
         try:
             found = tuple(float(number) for number in text.split(","))
         except ValueError:
             found = ()
-        if not 1 <= len(found) <= count or not all(map(math.isfinite, found)):
-            msg = f"wanted up to {count} finite numbers with commas between them, got {text!r}"
+        if not least <= len(found) <= count or not all(map(math.isfinite, found)):
+            most = f"up to {count}" if least < count else count
+            msg = f"wanted {most} finite numbers with commas between them, got {text!r}"
             raise argparse.ArgumentTypeError(msg)
         return found + (0.0,) * (count - len(found))
 

@@ -24,7 +24,7 @@ class AddOptions:
     )
     layer: int = setting(1, "lower layers are worn underneath", parse=int, metavar="N")
     color: tuple[float, float, float] | None = setting(
-        None, "sRGB, each from 0 to 1", parse=cli.numbers(3), metavar="R,G,B"
+        None, "sRGB, each from 0 to 1", parse=cli.numbers(3, least=3), metavar="R,G,B"
     )
     held_at: str | None = setting(
         None, "what holds it: waist or shoulders (default: found from where it lies)", choices=("waist", "shoulders")

@@ -388,11 +388,12 @@ def make_odd_metadata(path: Path) -> None:
     [
         (lambda _: None, "No such file or directory; wanted a .mcap or .db3 file"),
         (Path.touch, "an empty file"),
-        (Path.mkdir, "no .mcap or .db3 file in this directory"),
+        (Path.mkdir, "no .mcap or .db3 file in this directory; wanted .* a file of motion"),
         (
             lambda path: path.write_text("hello, world"),
             "not an MCAP file; wanted a .mcap or .db3 file, a rosbag2 directory",
         ),
+        (lambda path: (path.mkdir(), (path / "0.db3").write_text("hello, world")), "not an SQLite file; wanted"),
         (make_sqlite, "the database can.t be read"),
         (make_other_storage, "stored as my_storage .* only plain mcap or sqlite3 is read; convert it"),
         (make_missing_file_bag, "gone.mcap: can.t be .*: No such file"),

@@ -99,7 +99,7 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
         ({"betas": np.full(10, 1e300)}, "too large for float32"),
         ({"gender": "x" * 10_000}, "at most 32768 bytes of text"),
         ({"mocap_framerate": np.nan}, "frame rate"),
-        ({"mocap_framerate": "fast"}, "mocap_framerate must be one number"),
+        ({"mocap_framerate": "fast"}, "mocap_framerate must be one number, got .*; say it, as in --fps 30"),
     ],
 )
 def test_files_that_are_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

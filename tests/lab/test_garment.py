@@ -152,6 +152,12 @@ def test_what_makes_no_garment_is_said(arguments: list[str], wanted: str, folder
     assert not folder.exists()
 
 
+def test_a_colour_has_three_numbers(kilt: Path, capsys) -> None:
+    with pytest.raises(SystemExit):
+        main(["garment", "add", str(kilt), "--color", "0.5"])
+    assert "--color: wanted 3 finite numbers with commas between them, got '0.5'" in capsys.readouterr().err
+
+
 def test_what_is_wrong_is_said_of_its_file(folder: Path, kilt: Path, tmp_path: Path, capsys) -> None:
     """Of many meshes in a loop, or of a mesh and a pose, a sentence alone doesn't say which."""
     flat, lost = tmp_path / "flat.obj", tmp_path / "lost.npz"
