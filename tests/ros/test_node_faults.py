@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import select
 import signal
 import subprocess
@@ -76,13 +77,19 @@ def test_a_body_that_cannot_be_loaded_is_taken_back(scene: Peer, tmp_path: Path)
 
 
 def test_two_publishers_and_leaps_are_reported(scene: Peer) -> None:
+    sent = itertools.count(1000)
+
+    def said() -> str:
+        scene.send(frame(next(sent)))  # else it would be said instead that nothing comes
+        return scene.status("input")[1]
+
     other = Peer()
     try:
-        scene.spin_until(lambda: "2 publishers on" in scene.status("input")[1], "the second sender is seen")
+        scene.spin_until(lambda: "2 publishers on" in said(), "the second sender is seen")
         assert scene.status("input")[0] == 1
     finally:
         other.close()
-    scene.spin_until(lambda: "publishers on" not in scene.status("input")[1], "it is gone")
+    scene.spin_until(lambda: "publishers on" not in said(), "it is gone")
 
 
 def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer) -> None:
