@@ -74,10 +74,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._diagnostics = self.create_publisher(interface(adapters.DIAGNOSTIC_ARRAY), DIAGNOSTICS_TOPIC, 10)
         self._requests = Requests(self)
         self.add_on_set_parameters_callback(self._on_parameters)
-        for beat in (
-            self._look_after,
-            self._report,
-        ):  # what can't be looked after must not keep the rest from being told
+        for beat in (self._look_after, self._report):  # what fails in one must not keep the other from its work
             self.create_timer(_BEAT_S, self.guarded("each second", beat), clock=steady)
         if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
