@@ -95,9 +95,8 @@ class CdrReader:
 
     def _primitive(self, code: str) -> Any:
         primitive = _PRIMITIVES[self._order + code]
-        size = primitive.size
-        self._at += (HEADER_BYTES - self._at) % size
-        return primitive.unpack(self.skip(size))[0]
+        self.align(primitive.size)
+        return primitive.unpack(self.skip(primitive.size))[0]
 
     def length(self, *, item_bytes: int) -> int:
         """Length of a sequence whose items take at least `item_bytes` each."""

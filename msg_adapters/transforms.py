@@ -7,6 +7,7 @@ import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,18 +71,22 @@ def encode_transforms(transforms: Sequence[Transform]) -> bytes:
 
 def decode_transforms(data: Buffer) -> list[Transform]:
     """The transforms of a `tf2_msgs/TFMessage`. Raises `DecodeError` for anything that isn't one."""
-    return [Transform(*header, numbers[:3], numbers[3:]) for header, numbers in _read(data)]
+    headers, values = _read(data)
+    return [
+        Transform(stamp_ns, parent, child, value[:3], value[3:])
+        for (stamp_ns, parent, child), value in zip(headers, values, strict=True)
+    ]
 
 
-def _read(data: Buffer) -> list[tuple[tuple[int, str, str], NDArray[np.float64]]]:
-    """Stamps [ns], parents and children, and with each translation [m] and quaternion, shape (7,)."""
+def _read(data: Buffer) -> tuple[list[tuple[Any, ...]], NDArray[np.float64]]:
+    """Stamp [ns], parent and child of each transform, and translations [m] with quaternions, shape (N, 7)."""
     reader = CdrReader(data)
-    found: list[tuple[tuple[int, str, str], NDArray[np.float64]]] = []
+    headers, values = [], []
     for _ in reader.items(item_bytes=_MIN_TRANSFORM_BYTES):
-        stamp_ns, parent, child = reader.fields("Tss")
-        found.append(((stamp_ns, parent, child), reader.array("f8", 7)))
+        headers.append(reader.fields("Tss"))
+        values.append(reader.array("f8", 7))
     reader.finish()
-    return found
+    return headers, np.array(values, np.float64).reshape(-1, 7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,16 +184,15 @@ class TransformBuffer:
 
         Raises `DecodeError` for anything that isn't such a message.
         """
-        transforms, now = _read(data), self._clock()
+        (headers, values), now = _read(data), self._clock()
         if now >= self._forget_at:
             self._tracks = {name: one for name, one in self._tracks.items() if one.is_static or name in self._heard}
             self._heard, self._forget_at = set(), now + 1e-9 * HISTORY_NS
-        values = np.array([numbers for _, numbers in transforms], np.float64).reshape(-1, 7)
         values[~(np.abs(values) <= PLAUSIBLE_TRANSL).all(1)] = np.nan
         lengths = np.linalg.norm(values[:, 3:], axis=1)
         values[:, 3:] /= np.where(lengths == 0, 1, lengths)[:, None]
         refused = []
-        for ((stamp_ns, parent, child), _), value, length in zip(transforms, values, lengths.tolist(), strict=True):
+        for (stamp_ns, parent, child), value, length in zip(headers, values, lengths.tolist(), strict=True):
             if why := self._take(stamp_ns, parent.lstrip("/"), child.lstrip("/"), value, length, is_static):
                 refused.append(f"{child!r} in {parent!r}, {why}")
         return refused

@@ -159,7 +159,12 @@ class Listener:
         self, name: str, kind: str, topic: str, take: Callable[[bytes], object], qos: QoSProfile, **options: Any
     ) -> None:
         """Subscribes; names that aren't a person's begin with a slash. Raises `RefuError`."""
-        self._inputs[name] = self._node.create_subscription(interface(kind), topic, take, qos, raw=True, **options)
+
+        def come(data: bytes) -> None:
+            if name in self._inputs:  # else the executor had taken it before nobody listened
+                take(data)
+
+        self._inputs[name] = self._node.create_subscription(interface(kind), topic, come, qos, raw=True, **options)
 
     def _come(self, person: str, topic: str, data: bytes) -> None:
         """Records a message and lets it wait for its turn.
@@ -168,15 +173,13 @@ class Listener:
         requests would wait behind those of everybody: for seconds, where a crowd's come faster than they are followed.
         """
         node = self._node
-        if self.scene is None or person not in self._inputs:
+        if self.scene is None:
             return
         node.statistics.receive()
         node.recording.put(topic, self.stream.message_type, data, INPUT_QOS)
         self._queue(person, data, most=INPUT_QOS.depth, cause="stale")
 
     def _queue(self, name: str, data: bytes, *, most: int, cause: str) -> None:
-        if name not in self._inputs:  # the executor had taken it before nobody listened
-            return
         waiting = self._turns.setdefault(name, deque(maxlen=most))
         if len(waiting) == most:
             self._node.statistics.drop(cause)

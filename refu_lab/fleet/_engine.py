@@ -109,7 +109,10 @@ def _ctrl_c_waits() -> Iterator[None]:
 
 @contextmanager
 def _ctrl_c_comes_later() -> Iterator[None]:
-    """Holds an interrupt back until the end of the block: raised in a destructor, it would be lost."""
+    """Holds an interrupt back until the end of the block: raised in a destructor, it would be lost.
+
+    `_ctrl_c_waits` doesn't hold it back once there are threads that take signals, of libraries for instance.
+    """
     if threading.current_thread() is not threading.main_thread():  # which alone is interrupted
         yield
         return
