@@ -21,8 +21,9 @@ DEFAULT_GARMENTS: tuple[str, ...] = ("tshirt-male", "short-pant-male")
 """What a person wears if nothing else is said."""
 
 DEFAULT_MARGIN = 0.004
-"""ε: how far off the skin the vertices are pushed [m]. A garment's edges cut the corners between its vertices: with
-vertices exactly on the skin (ε = 0, the paper's fixed scale) edges run through it; a few mm clear nearly all."""
+"""ε: vertices nearer to the skin than this are pushed away, to half of it at least [m]. A garment's edges cut the
+corners between its vertices: with vertices exactly on the skin (ε = 0, the paper's fixed scale) edges run through it; a
+few mm clear nearly all."""
 MAX_MARGIN = 0.05
 """The largest ε that makes sense [m]: a garment farther off the skin isn't worn."""
 

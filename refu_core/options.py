@@ -186,7 +186,10 @@ class DressOptions(PipelineOptions):
     """`PipelineOptions`, and how the garments are worn."""
 
     margin: float = setting(
-        DEFAULT_MARGIN, "Clearance that is kept from the skin [m].", within=(0.0, MAX_MARGIN), metavar="M"
+        DEFAULT_MARGIN,
+        "Cloth nearer to the skin than this is pushed away from it [m].",
+        within=(0.0, MAX_MARGIN),
+        metavar="M",
     )
     style: tuple[float, ...] = setting(
         (0.0,) * N_STYLES,

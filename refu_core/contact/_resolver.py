@@ -56,9 +56,9 @@ class Resolver:
     """Brings one garment off posed bodies.
 
     The steps: where an approximate distance has missed the closest face, a neighbour's face leads to it; vertices
-    nearer than the margin are pushed along the gradient (ReFU, paper, Eq. 2); their neighbours give way; edges that
-    still run too low are raised. A step that depends on other vertices is a step of its own, so the order of vertices
-    plays no role.
+    nearer than the margin are pushed along the gradient (ReFU, paper, Eq. 2), to half the margin at least and in the
+    order in which they lay; their neighbours give way; edges that still run too low are raised. A step that depends on
+    other vertices is a step of its own, so the order of vertices plays no role.
 
     On a CPU, steps that concern no vertex are left out. To know that, a GPU would have to be waited for. So it gets the
     same launches in every frame, as a CUDA graph needs, and the numbers of a `Resolution` stay on it.

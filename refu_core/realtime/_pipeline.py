@@ -82,7 +82,7 @@ class GarmentPipeline:
         self.threads = len(steps)
         """How many calls may run at the same time; on a GPU, how many parts of a batch."""
         self.margin = margin
-        """Clearance that is kept from the skin [m]; None for what each garment's weights were trained with."""
+        """Cloth nearer to the skin is pushed away [m]; None for what each garment's weights were trained with."""
         self._style = style
         on_gpu = outfit.body.device.type == "cuda"
         self._graphs = StepGraphs(partial(packed_by, steps), outfit.body.device) if graph and on_gpu else None
@@ -144,7 +144,8 @@ class GarmentPipeline:
             backbone: `tailornet`, `dynamic` (which heeds `SmplFrame.past`), `mlp`, `gcnn`, or `skinned`, which needs no
                 weights; by default (`auto`) the first of `dynamic` and `tailornet` that ships, `skinned` if neither.
             style: γ of all garments, shape (4,); the mean style if not given.
-            margin: clearance ε that is kept from the skin [m]; by default what the weights were trained with.
+            margin: ε: cloth nearer to the skin than this is pushed away from it [m], to half of it at least, to a
+                quarter where it lies over other cloth; by default what the weights were trained with.
             weights: folder of your own weights (`refu train`), a subfolder per garment; by default those that ship.
             device: torch device, `cpu` or `cuda`.
             graph: on CUDA, capture the whole of a frame as a CUDA graph; otherwise it is launched stage by stage.

@@ -5,10 +5,15 @@ from __future__ import annotations
 import functools
 import math
 
+import numpy as np
 import pytest
 import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from slow_contact import resolve
 from torch import Tensor
+from torch.nn import functional
 
 from refu_core import GarmentTemplate, SmplBody, load_body, load_garment
 from refu_core.contact import Blend, ContactSettings, Resolution, Resolver
@@ -155,6 +160,25 @@ def test_going_on_is_as_asking_everyone_again(kind: str) -> None:
     assert (again.vertices - done.vertices).abs().max() > 1e-4
     torch.testing.assert_close(again.vertices, anew.vertices, rtol=0, atol=1e-6)
     torch.testing.assert_close(again.numbers, anew.numbers, rtol=0, atol=1e-6)
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(-0.03, 0.01), min_size=2, max_size=12), st.sampled_from([0.001, 0.004, 0.01]))
+def test_layers_of_cloth_stay_in_order(heights: list[float], margin: float) -> None:
+    """Over flat skin: what was lower stays lower, at half the margin at least, and no two get farther apart."""
+    box = trimesh.creation.box((2.0, 2.0, 0.2))
+    sdf = ExactSdf(torch.tensor(box.faces))
+    sdf.update(torch.tensor(box.vertices, dtype=torch.float32))
+    before = np.sort(heights)
+    piece = torch.tensor([[0, 0], [1e-3, 0], [0, 1e-3]])
+    layers = [functional.pad(piece, (0, 1), value=0.1 + height) for height in before]
+    faces = torch.arange(3 * len(layers)).reshape(-1, 3)
+    after = Resolver(faces, 3 * len(layers))(torch.cat(layers), sdf, sdf.query(torch.cat(layers)), margin=margin)
+    height = after.vertices[::3, 2].double().numpy() - 0.1
+    assert (np.diff(height) > -1e-6).all()
+    assert (np.diff(height) < np.diff(before) + 1e-6).all()
+    assert height.min() > 0.5 * margin - 1e-6
+    np.testing.assert_allclose(height[before >= margin], before[before >= margin], atol=1e-6)
 
 
 @pytest.mark.parametrize("margin", [-0.01, math.nan, math.inf])

@@ -138,7 +138,9 @@ class _State:
         else:
             alpha = torch.full_like(distance, float(scale))
         # Where α is below 1, the distance was predicted to exaggerate; its sign is trusted all the same.
-        deficit = self.margin - distance
+        deficit, half = self.margin - distance, 0.5 * self.margin
+        if half > 0:  # cloth stays in order: what is deeper ends lower, at half the margin at least
+            alpha = alpha * (1 - half * (1 - torch.exp(-deficit / half)) / deficit)
         return torch.maximum(alpha, (min(self.tolerance, self.margin) - distance) / deficit)
 
 
@@ -150,11 +152,11 @@ def _push_blended(
     goal[rows] = (sample.distance + scale * (state.margin - sample.distance)).clamp_max(state.margin)
     is_pushed = torch.zeros_like(goal, dtype=torch.bool)
     is_pushed[rows] = True
-    push = torch.zeros_like(state.origin)
-    moved = repulse(state.vertices[rows], sample, scale=scale, margin=state.margin)
-    push[rows] = moved - state.vertices[rows]
     least = torch.full_like(goal, torch.inf)
     least[rows] = state.margin - sample.distance
+    push = torch.zeros_like(state.origin)
+    # Not by `repulse`: the least pushes are lost where they are added to a place.
+    push[rows] = (scale * least[rows]).clamp_max(state.max_displacement)[:, None] * sample.gradient
     field = blend.spread(push[:, None], least=least[:, None])[:, 0]
     everyone = torch.nonzero((field != 0).any(dim=-1))[:, 0]
     moved = state.bounded(state.origin[everyone] + field[everyone], everyone)
