@@ -13,6 +13,7 @@ from torch import Tensor
 
 from refu_core.contact import Blend
 from refu_core.errors import MeshError
+from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import Refu
 from refu_core.sdf import ExactSdf, SdfSample
 
@@ -111,6 +112,12 @@ def test_refuses_faces_of_other_vertices() -> None:
         Blend.of_faces(faces, 8)
 
 
+def share(distance: Tensor) -> Tensor:
+    """How much of what lacks to the default margin a push takes, so that cloth keeps its order."""
+    deficit = DEFAULT_MARGIN - distance
+    return 1 - DEFAULT_MARGIN / 2 * -torch.expm1(-2 * deficit / DEFAULT_MARGIN) / deficit
+
+
 class Floor:
     """The half-space y < 0 is the body; keeps what it was asked."""
 
@@ -142,7 +149,7 @@ def test_blended_cloth_is_outside_and_keeps_its_shape_better(dented: tuple[Tenso
     points, faces = dented
     blend = Blend.of_faces(faces, len(points))
     plain, blended = (resolve(points, Floor(), blend=b).vertices for b in (None, blend))
-    assert blended[:, 1].min() >= 0.004 - 2e-4
+    assert blended[:, 1].min() >= 0.5 * DEFAULT_MARGIN - 1e-6
 
     def laplacian_error(vertices: Tensor) -> float:
         displacement = vertices - points
@@ -169,7 +176,7 @@ def test_blended_on_a_sphere(dented: tuple[Tensor, Tensor]) -> None:
     sdf.update(torch.tensor(mesh.vertices, dtype=torch.float32) + points[480] - torch.tensor([0.0, 0.095, 0.0]))
     done = resolve(points, sdf, blend=Blend.of_faces(faces, len(points)))
     assert done.n_inside >= 5
-    assert sdf.query(done.vertices).distance.min() >= 0.004 - 2.1e-4
+    assert sdf.query(done.vertices).distance.min() >= 0.5 * DEFAULT_MARGIN - 1e-5
 
 
 def test_known_distances_are_not_asked_for(dented: tuple[Tensor, Tensor]) -> None:
@@ -198,11 +205,12 @@ def test_predicted_scale_of_the_first_push(dented: tuple[Tensor, Tensor], is_ble
     done = resolve(points, Floor(), scale=scale, blend=blend)
     (rows,) = asked
     assert torch.equal(rows, torch.nonzero(points[:, 1] < 0.004)[:, 0])
-    wanted = points[rows, 1] + 1.5 * (0.004 - points[rows, 1])
+    wanted = points[rows, 1] + 1.5 * share(points[rows, 1]) * (DEFAULT_MARGIN - points[rows, 1])
     if is_blended:
-        # It is where the field begins: that ends no lower than the margin, and higher than from a scale of 1.
+        # It is where the field begins: that ends no lower than it was sent, up to the margin, and higher than from a
+        # scale of 1.
         height = resolve(points, Floor(), blend=blend).vertices[:, 1]
-        assert (done.vertices[rows, 1] >= 0.004 - 1e-6).all()
+        assert (done.vertices[rows, 1] >= wanted.clamp_max(DEFAULT_MARGIN) - 1e-6).all()
         assert done.vertices[rows, 1].mean() > height[rows].mean() + 5e-5
     else:
         torch.testing.assert_close(done.vertices[rows, 1], wanted)
@@ -213,7 +221,7 @@ def test_predicted_scale_of_the_first_push(dented: tuple[Tensor, Tensor], is_ble
 def test_a_scale_below_one_is_believed_but_not_into_the_body() -> None:
     points = torch.tensor([[0.0, 0.002, 0.0], [0.0, -0.01, 0.0]])
     done = resolve(points, Floor(), scale=0.5)
-    torch.testing.assert_close(done.vertices[0, 1], torch.tensor(0.003))
+    torch.testing.assert_close(done.vertices[0, 1], 0.002 + 0.5 * share(torch.tensor(0.002)) * 0.002)
     assert 0 <= float(done.vertices[1, 1]) < 0.004
     assert done.n_unresolved == 0
 
@@ -238,5 +246,7 @@ def test_the_layer_blends_batches_as_resolve_does(dented: tuple[Tensor, Tensor])
     layer = Refu(len(points), least=1.0, scale=None)
     pushed = blend.follow(both, layer(both, sample), layer.margin - sample.distance)
     for garment, done in zip(both, pushed, strict=True):
-        torch.testing.assert_close(done, resolve(garment, Floor(), blend=blend).vertices)
+        # The layer takes all vertices to the margin.
+        whole = resolve(garment, Floor(), blend=blend, scale=lambda _rows, distance: 1 / share(distance))
+        torch.testing.assert_close(done, whole.vertices)
     assert np.isfinite(pushed.numpy()).all()
