@@ -120,6 +120,7 @@ def _serve() -> None:
             os.environ.update(order["environment"])
             sys.path[:0] = order["path"]
             sys.argv = order["program"]
+            gc.freeze = lambda: None  # a node that is out of the collector's sight would be on the graph for 20 s more
             code = sys.modules[f"refu_ros.{sys.argv[0]}"].main()
             atexit._run_exitfuncs()
             gc.collect()  # what leaves the graph with its end
