@@ -28,7 +28,7 @@ from refu_core.realtime import PipelineOutput
 from refu_lab.commands._common import require_apart
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.dressed_bag import DressedBag, garment_meshes
-from refu_lab.sources import body_facts, open_source
+from refu_lab.sources import Source, body_facts, open_source
 from refu_lab.truth import GroundTruth
 
 When = Literal["before", "after"]
@@ -207,13 +207,15 @@ def replay(
     options: ReplayOptions,
     *,
     pipeline: GarmentPipeline | None = None,
+    source: Source | None = None,
     progress: bool = False,
     told: Callable[[int, int], object] | None = None,
 ) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, and measures.
 
-    `pipeline` is the result of `options.load_pipeline()`, if that was called already. `progress` shows a bar. `told` is
-    called a few times a second with how many frames are done, and of how many (0 where that isn't known).
+    `pipeline` is the result of `options.load_pipeline()`, if that was called already, and `source` that of
+    `open_source`. `progress` shows a bar. `told` is called a few times a second with how many frames are done, and of
+    how many (0 where that isn't known).
 
     An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned. Raises
     `RefuError`: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
@@ -223,7 +225,7 @@ def replay(
         require_apart(options.input, options.output)
     load = cache(lambda: pipeline or options.load_pipeline())
     with ExitStack() as stack:
-        source = open_source(options, lambda: load().body)  # before the pipeline: a bad input is reported at once
+        source = source or open_source(options, lambda: load().body)  # first: a bad input is reported at once
         options = replace(options, frame_id=options.frame_id or source.frame_id)
         pipeline = load()
         # Compiles the kernels, so that the first frame isn't late; in a pose nobody sends, so none counts as known.

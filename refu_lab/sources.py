@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,16 @@ import msg_adapters as adapters
 from msg_adapters import FrameRecord
 from msg_adapters.axes import WORLD_FRAME, up_of
 from msg_adapters.inputs import body_of
-from refu_core import FrameError, GarmentPipeline, RefuError, SmplBody, SmplFrame
-from refu_core.body import BodyFit
+from refu_core import FrameError, RefuError, SmplFrame
 from refu_core.history import PoseHistory
 from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
 from refu_core.recordings import GENDERS, SUFFIXES, upright_turn
 from refu_lab.commands.replay import RecordingOptions
+
+if TYPE_CHECKING:  # what a file has may be told without torch
+    from refu_core import GarmentPipeline, SmplBody
+    from refu_core.body import BodyFit
 
 INPUT_TOPIC = f"/{adapters.SMPL_TOPIC}"
 _SHOWN = 8

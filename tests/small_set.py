@@ -27,12 +27,13 @@ def write_set(
     poses: int = 6,
     test_pairs: int = 3,
     spread: float = 0.2,
+    turn: float | None = None,
     displacement: Callable[[Tensor], Tensor] | None = None,
 ) -> Path:
     """Writes garments that follow the skin, displaced by a function of the poses (N, 24, 3) to (N, V, 3) [m].
 
-    `pairs` style-shape pairs with `poses` poses each, whose angles spread by `spread` [rad]; the last `test_pairs` are
-    for the test.
+    `pairs` style-shape pairs with `poses` poses each, whose angles spread by `spread` [rad], those of the root by
+    `turn`, if given; the last `test_pairs` are for the test.
     """
     rng = np.random.default_rng(0)
     n = pairs * poses
@@ -40,6 +41,8 @@ def write_set(
     betas = rng.normal(size=(pairs, 10)).astype("<f4")[pair]
     style = rng.normal(size=(pairs, 4)).astype("<f4")[pair]
     pose = rng.normal(0, spread, (n, 24, 3)).astype("<f4")
+    if turn is not None:
+        pose[:, 0] *= turn / spread
     with torch.no_grad():
         b, p = torch.as_tensor(betas), torch.as_tensor(pose)
         unposed = garment.rest(b, garment.own(torch.as_tensor(style)))

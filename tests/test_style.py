@@ -154,6 +154,7 @@ FORBIDDEN = {
     "msg_adapters": {"torch", "warp", "rclpy", "refu_core.body"} | HEAVY,
     "refu_core": {"torch", "warp", "rclpy", "msg_adapters"} | HEAVY,
     "refu_lab.cli": {"torch", "warp", "rclpy"} | HEAVY,
+    "refu_lab.sources": {"torch", "warp", "rclpy"} | HEAVY,
     "refu_core.realtime": {"rclpy", "msg_adapters", "refu_core.metrics", "refu_core.simulation"} | HEAVY,
     "refu_core.metrics": {"rclpy", "msg_adapters"} | HEAVY,
     "refu_core.training": {"rclpy", "msg_adapters", "numba"},

@@ -135,12 +135,14 @@ class TrainingSet:
         garment: str | GarmentTemplate,
         dataset: str | Path | GarmentDataset | GarmentSequences,
         body: SmplBody | None,
+        *,
+        who: Callable[[Tensor], Tensor] | None = None,
     ) -> TrainingSet:
         """Opens a set; the body is the garment's own if not given. Raises `RefuError` as `read_samples`."""
         template = load_garment(garment) if isinstance(garment, str) else garment
         body = load_body(template.body) if body is None else body
         rows = open_dataset(dataset) if isinstance(dataset, (str, Path)) else dataset
-        return cls(template, body, rows, read_samples(rows, body, template, split="train"))
+        return cls(template, body, rows, read_samples(rows, body, template, split="train", who=who))
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -193,10 +195,16 @@ def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor
 
 
 def read_samples(
-    dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate, *, split: str
+    dataset: GarmentDataset | GarmentSequences,
+    body: SmplBody,
+    garment: GarmentTemplate,
+    *,
+    split: str,
+    who: Callable[[Tensor], Tensor] | None = None,
 ) -> TrainingSamples:
     """The samples of one split, `train` or `test`, with the simulated poses; of sequences, the frames that were kept.
 
+    `who` may say of poses (N, 24, 3) which of them are wanted, (N,): to pull a body's limbs apart takes long.
     Raises `RefuError` when the set is of another garment or body, or the split has no finished sample.
     """
     check_set(dataset, body, garment)
@@ -208,6 +216,9 @@ def read_samples(
         stored = _frames(dataset, rows)
     else:
         stored = {name: dataset.column(name)[rows] for name in ("vertices", "pose", "betas", "style", "pair")}
+    if who is not None:
+        wanted = who(torch.as_tensor(stored["pose"])).numpy()
+        stored = {name: values[wanted] for name, values in stored.items()}
     vertices = stored.pop("vertices")[:, dataset.parts[garment.name]]
     pose, betas, style, pair = (torch.as_tensor(stored[name]) for name in ("pose", "betas", "style", "pair"))
     along = TakenAlong(body, garment)

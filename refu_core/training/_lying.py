@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from refu_core.backbones import (
     Backbone,
@@ -26,7 +27,6 @@ from refu_core.garments import GarmentTemplate
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training._data import (
     Mirror,
-    TrainingSamples,
     TrainingSet,
     displacements,
     mirrored,
@@ -84,10 +84,10 @@ def train_lying(
             there is of another training.
         WeightsError: no tailornet there, or a damaged one.
     """
-    opened = TrainingSet.of(garment, dataset, body)
+    opened = TrainingSet.of(garment, dataset, body, who=_lie)
     template, body, folder = opened.garment, opened.body, Path(folder)
-    test = _lying(read_samples(opened.rows, body, template, split="test"))
-    samples = _lying(opened.samples)
+    test = read_samples(opened.rows, body, template, split="test", who=_lie)
+    samples = opened.samples
     if not len(samples) or not len(test):
         msg = f"wanted lying people to learn from and to test on, the set of {template.name} has {len(samples)} and "
         raise RefuError(f"{msg}{len(test)}: refu simulate --postures")
@@ -106,7 +106,8 @@ def train_lying(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         lying = Lying(LyingConfig(upright.config.joints), decoder)
-    rehearsed = _lying(rehearsal.of(stored.card, upright, known=opened.card["plan"]))
+    rehearsed = rehearsal.of(stored.card, upright, known=opened.card["plan"])
+    rehearsed = rehearsed.take(_lie(rehearsed.pose))
     owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
     parts = [
         (lying.seen(one.betas, one.pose, one.style), decoder.encode(added))
@@ -135,6 +136,6 @@ def train_lying(
     return card
 
 
-def _lying(samples: TrainingSamples) -> TrainingSamples:
-    """Those of people who lie, or nearly."""
-    return samples.take(lying_share(up_in_root(samples.pose)) > 0)
+def _lie(pose: Tensor) -> Tensor:
+    """Which of some people (N, 24, 3) lie, or nearly, shape (N,)."""
+    return lying_share(up_in_root(pose)) > 0

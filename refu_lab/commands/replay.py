@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -124,14 +124,28 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _replay_one(args: argparse.Namespace) -> int:
-    from refu_lab.replay import replay
+    from refu_lab.sources import open_source
     from refu_lab.tables import replay_table
 
     report = None if args.report is None else Path(args.report)
     output = None if args.output is None else Path(args.output)
     options = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
+    if output is not None:
+        cli.require_apart(options.input, output)
+
+    @cache
+    def load() -> GarmentPipeline:
+        from refu_core._device import one_thread
+
+        with one_thread():
+            return options.load_pipeline()
+
+    source = open_source(options, lambda: load().body)  # a bad bag is reported before torch is imported
+
+    from refu_lab.replay import replay
+
     told = partial(print, "progress", flush=True) if args.progress == "lines" else None
-    result = replay(options, progress=not args.quiet, told=told)
+    result = replay(options, pipeline=load(), source=source, progress=not args.quiet, told=told)
     cli.tell(args, replay_table(result), result.as_dict())
     if report is not None and result.frames:
         from refu_lab.report import write_report

@@ -6,6 +6,7 @@ one and gives the same result there, which depends only on the task's content.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hashlib
 import logging
@@ -38,6 +39,10 @@ ALLOWED_FAILURES = 5
 
 class FleetError(RefuError):
     """Workers can't be started, or can't be reached any more."""
+
+
+_LAST_WORDS_S = 1.0
+"""How long a process may go on when it is ended [s]: by default Dask waits 4 s for a task that takes minutes."""
 
 
 @contextmanager
@@ -91,10 +96,16 @@ def _own_cluster(jobs: int | None) -> Iterator[Any]:
             dashboard_address="127.0.0.1:0",  # drawn by bokeh, or without it a few pages of text
             silence_logs=logging.CRITICAL,
         )
+
+    async def end() -> None:
+        ends = (one.close(timeout=_LAST_WORDS_S) for one in cluster.workers.values())
+        await asyncio.gather(*ends, return_exceptions=True)  # the cluster waits for who takes longer
+
     try:
         yield cluster
     finally:
         with _ctrl_c_waits():
+            cluster.sync(end)
             cluster.close()
 
 

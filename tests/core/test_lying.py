@@ -99,7 +99,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     card = json.loads((folder / "standing" / "card.json").read_text())
     plan = asdict(SamplePlan(OWN, 60, pivots=4, recorded_share=0.0))
     (folder / "standing" / "card.json").write_text(json.dumps(card | {"plan": plan}))
-    write_set(folder / "lying", garment, body, pairs=40, poses=8, spread=1.2, displacement=on_a_bed)
+    write_set(
+        folder / "lying", garment, body, pairs=60, poses=4, test_pairs=8, spread=0.8, turn=1.3, displacement=on_a_bed
+    )
     loop = LoopSettings(batch_size=16, check_every=20)
     few = PretrainSettings(loop, rank=4, style_shape_steps=2, low_steps=2, steps=2)
     pretrain(OWN, folder / "standing", folder / "weights", settings=few, quiet=True)

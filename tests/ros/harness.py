@@ -24,6 +24,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
@@ -46,6 +47,8 @@ PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
 
+_TURN_S = 0.02
+"""How long a node in the tests' process, and then its peer, does what there is to do, until the test looks again."""
 _QUIET_S = 0.05
 """After so long without anything to do an executor has nothing left to do."""
 _LAST_WORDS_S = 20.0
@@ -152,7 +155,7 @@ class Peer:
         end = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < end, f"waited {timeout} s in vain: {what}"
-            rclpy.spin_once(self.node, timeout_sec=0.02)
+            rclpy.spin_once(self.node, timeout_sec=_TURN_S)
 
     def spin(self, seconds: float) -> None:
         """For so long."""
@@ -259,7 +262,8 @@ class NodeHere:
         """Fails with `what` when it doesn't come true."""
 
         def both() -> Any:
-            self._executor.spin_once(timeout_sec=0.02)
+            # All that comes: one event at a time, the node would fall behind a test that sends each time it looks.
+            self._executor.spin_until_future_complete(Future(), timeout_sec=_TURN_S)
             return condition()
 
         self.peer.spin_until(both, what, **options)

@@ -1,7 +1,7 @@
 """Programs that begin at once: a process that has imported what they import, and forks one for each that asks.
 
 To import torch takes seconds, and some forty programs are started by the tests. Nothing but modules is shared: rclpy is
-started, and warp, by each for itself.
+started, and warp, by each for itself. And they say five times a second how they are, not once: tests wait for that.
 """
 
 from __future__ import annotations
@@ -89,6 +89,7 @@ def _serve() -> None:
     """Forks until there is nobody to ask any more."""
     from refu_ros import _node, _worker, garment_node, smpl_publisher  # noqa: F401  (and all that they import)
 
+    _node._BEAT_S = 0.2
     gc.freeze()  # a collector that goes through all of it would copy it, too
     running: dict[int, Path] = {}
 
@@ -120,6 +121,7 @@ def _serve() -> None:
             os.environ.update(order["environment"])
             sys.path[:0] = order["path"]
             sys.argv = order["program"]
+            gc.freeze = lambda: None  # a node that is out of the collector's sight would be on the graph for 20 s more
             code = sys.modules[f"refu_ros.{sys.argv[0]}"].main()
             atexit._run_exitfuncs()
             gc.collect()  # what leaves the graph with its end

@@ -76,8 +76,9 @@ class Robot(NodeHere):
 
 def _is_of(message: Any, sent: SmplFrame) -> bool:
     """Whether it may be of the frame: by its stamp, where it has one."""
-    stamp = message.header.stamp if hasattr(message, "header") else None
-    return stamp is None or stamp.sec * 10**9 + stamp.nanosec == sent.stamp_ns
+    parts = message.markers if isinstance(message, MarkerArray) else [message]
+    stamps = [part.header.stamp for part in parts if hasattr(part, "header")]
+    return all(stamp.sec * 10**9 + stamp.nanosec == sent.stamp_ns for stamp in stamps)
 
 
 @pytest.fixture

@@ -277,9 +277,12 @@ def test_a_bag_is_dressed_beside_the_stream(peer: Peer, bags: Path) -> None:
 
 def test_a_bag_is_read_in_the_axes_of_the_node(bags: Path, tmp_path: Path) -> None:
     garments: dict[str, np.ndarray[Any, Any]] = {}
+    jobs = {}
     for axes in ("smpl", "frame"):
-        settings = NodeSettings(garments=GARMENTS[:1], backbone="skinned", input_axes=axes)
-        BagJob(bags / "walk.mcap", tmp_path / f"{axes}.mcap", settings, lambda *_: None).done.result()
+        settings = NodeSettings(garments=GARMENTS[:1], backbone="skinned", sdf="none", input_axes=axes)
+        jobs[axes] = BagJob(bags / "walk.mcap", tmp_path / f"{axes}.mcap", settings, lambda *_: None)
+    for axes, job in jobs.items():
+        job.done.result()
         with BagReader(tmp_path / f"{axes}.mcap") as bag:
             first = next(message for message in bag.messages(["/garments"]))
         garments[axes] = adapters.decode_marker_array(first.data)[0].points
