@@ -162,7 +162,7 @@ def in_order(deficit: float, margin: float) -> float:
     once.
     """
     half = 0.5 * margin
-    return 1.0 - half * (1.0 - wp.exp(-deficit / half)) / deficit
+    return 1.0 - half * (1.0 - float(wp.exp(-deficit / half))) / deficit
 
 
 @wp.kernel
