@@ -134,11 +134,21 @@ class Peer:
         }
         self.garments: list[list[Marker]] = []
         self.diagnostics: list[DiagnosticArray] = []
+        self._from_ns = 0
         self._subscription: Any = None
         self._clients: dict[str, Any] = {}
         self._encode = encoder_for("joint_state")
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, 10)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 10)
         self.watch()
+
+    def _report(self, report: DiagnosticArray, info: dict[str, Any]) -> None:
+        if info["source_timestamp"] >= self._from_ns:
+            self.diagnostics.append(report)
+
+    def forget_reports(self) -> None:
+        """Only what is reported from now on counts, and nothing that is still on its way."""
+        self._from_ns = time.time_ns()
+        self.diagnostics.clear()
 
     def watch(self) -> None:
         """Listens to the garments."""

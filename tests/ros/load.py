@@ -119,7 +119,7 @@ class LoadPeer(Peer):
 
     def _stale(self) -> int:
         """Frames that were dropped for a newer one, by what the node tells of itself from now on."""
-        self.diagnostics.clear()
+        self.forget_reports()
         self.spin_until(
             lambda: sum(status.name == "garment_node: input" for d in self.diagnostics for status in d.status) > 1,
             "the node tells of itself",
@@ -155,7 +155,7 @@ class LoadPeer(Peer):
                 came_before, came = came, len(self._came)
                 used_before, used = used, _processor_ms(process)
                 self._cpu.append((used - used_before) / max(1, came - came_before))
-                self.diagnostics.clear()
+                self.forget_reports()
         end = time.monotonic() + _LAST_S
         while time.monotonic() < end and self._sent[-1] not in self._came:
             rclpy.spin_once(self.node, timeout_sec=0.1)

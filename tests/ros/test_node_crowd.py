@@ -212,7 +212,7 @@ def test_a_crowd_of_bodies_and_a_long_name_take_nothing_from_others(ros: None, t
         peer.spin_until(lambda: said in peer.status("input")[1], "it says how many there are")
         peer.spin_until(lambda: sum(one.get_subscription_count() for one in crowd) >= MOST_PEOPLE - 1, "it listens")
         for _ in range(2):
-            peer.diagnostics.clear()
+            peer.forget_reports()
             peer.spin_until(lambda: peer.status("node")[1] == "active", "it says how it is")
         assert sum(one.get_subscription_count() for one in crowd) == MOST_PEOPLE - 1
         assert peer.listeners("p0")  # who was here stays

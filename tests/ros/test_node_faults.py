@@ -125,6 +125,6 @@ def test_a_second_node_of_the_name_is_reported_by_both(scene: Peer, tmp_path: Pa
         scene.dress(frame(50))
         scene.spin_until(lambda: "2 nodes are called" in second.log, "the second one says so, too")
         assert second.stop(signal.SIGINT) == 0, second.log
-    scene.diagnostics.clear()
+    scene.forget_reports()
     scene.spin_until(lambda: scene.diagnostics and "2 nodes" not in scene.status("garments")[1], "the twin is gone")
     scene.dress(frame(51))

@@ -56,7 +56,7 @@ class Stage(NodeHere):
 
     def reports(self, times: int = 2) -> tuple[int, str, dict[str, str]]:
         """The input's status after so many more words of the node."""
-        self.peer.diagnostics.clear()
+        self.peer.forget_reports()
         self.until(lambda: len(self.peer.diagnostics) >= times, "the node says how it is")
         return self.peer.status("input")
 
@@ -199,7 +199,7 @@ def test_so_are_recordings(stage: Callable[..., Stage], tmp_path: Path) -> None:
     (result,) = scene.node.set_parameters([Parameter("record", value=str(tmp_path / "bag"))])
     assert result.successful, result.reason
     for bag in ("bag", "bag-1"):
-        scene.peer.diagnostics.clear()
+        scene.peer.forget_reports()
         scene.until(lambda: scene.heard() == 1, "the input is recorded")
         scene.until(recorded, "messages are recorded")
         switch(False)

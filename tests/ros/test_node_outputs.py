@@ -366,10 +366,10 @@ def test_without_transforms_the_frame_is_warned_of(
     scene.hear("points", PointCloud2)
     scene.sends(frame(1), "points", data=encoder_for("joint_state")(frame(1), frame_id="camera"))
     assert scene.heard["points"][-1].header.frame_id == "map"
-    scene.peer.diagnostics.clear()
+    scene.peer.forget_reports()
     scene.until(lambda: scene.peer.diagnostics, "the node says how it is")
     assert scene.peer.status("input")[2]["frame"] == "camera, shown as map"
-    scene.peer.diagnostics.clear()
+    scene.peer.forget_reports()
 
     def warned() -> bool:
         scene.peer.send_raw(encoder_for("joint_state")(frame(1), frame_id="camera"))

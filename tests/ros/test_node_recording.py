@@ -100,7 +100,7 @@ def test_a_kill_leaves_all_but_the_last_chunk(ros: None, tmp_path: Path) -> None
         NodeProcess(tmp_path / "log.txt", namespace=namespace, **CHEAP, record=bag) as node,
     ):
         published = play(peer)
-        peer.diagnostics.clear()
+        peer.forget_reports()
         peer.spin_until(lambda: peer.status("recording")[2].get("queued") == "0", "all is written")
         node.stop(signal.SIGKILL)
     assert not (bag / "metadata.yaml").exists()

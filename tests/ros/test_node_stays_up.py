@@ -103,7 +103,7 @@ def test_no_clock_ends_it(scene: tuple[Peer, NodeProcess]) -> None:
         message = Clock()
         message.clock.sec, message.clock.nanosec = seconds, nanoseconds
         clock.publish(message)
-        peer.diagnostics.clear()
+        peer.forget_reports()
         peer.spin_until(lambda: peer.diagnostics, f"it lives at {seconds} s")
     peer.spin_until(lambda: count(peer, "/clock") >= 2, "clocks without sense are counted")
     assert "wanted a stamp that fits a ROS time" in node.log
