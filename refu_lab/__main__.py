@@ -1,5 +1,6 @@
 """The command `refu`, which is `python -m refu_lab`: an interrupt ends it without a traceback from the start."""
 
+import gc
 import signal
 import sys
 
@@ -13,7 +14,9 @@ def main() -> int:
     from refu_lab.cli import main as run
 
     signal.signal(signal.SIGINT, before)
-    return run()
+    code = run()
+    gc.freeze()  # else the interpreter's end goes through all that torch and Warp have made, for a second and more
+    return code
 
 
 if __name__ == "__main__":
