@@ -55,7 +55,9 @@ class Parting:
         `far` (V,) says how far from the sheet each vertex is at least [m], if that is known: faces too far off to cut
         it are skipped.
         """
-        if far is not None:
+        if far is None:
+            self._far.zero_()
+        else:
             self._far.copy_(far)
         self._sheet.fit()
         with torch_stream(self._device):
@@ -83,15 +85,14 @@ class Parting:
         return self._points.clone()
 
     def parted(self, above: Tensor, distance: Tensor) -> Tensor:
-        """The outer garment, (V, 3) [m], moved off the sheet, by `parting_most` at most, if that leaves fewer cuts.
+        """The outer garment, (V, 3) [m], moved off the sheet if that leaves fewer cuts; else the very same on a CPU.
 
         `distance` (V,) is how far from the sheet its vertices are at least [m]. An approximate one may be too long and
-        hide a cut, but hid none in 444 frames. Where a hand is deep in a hip, the way out of one leads into the other,
-        and nothing is done.
+        hide cuts. So it only says where to look for a first one; if there is one, all are looked for. Where a hand is
+        deep in a hip, the way out of one leads into the other, and nothing is done.
         """
-        n_before = self.find(above, distance)
-        if self._is_serial and not int(n_before):
+        n_seen = self.find(above, distance)
+        if self._is_serial and not int(n_seen):
             return above
-        way = torch.renorm(self.part(above) - above, 2, 0, self._settings.parting_most)
-        parted = above + way
-        return torch.where(self.find(parted, distance - way.norm(dim=1)) < n_before, parted, above)
+        n_before, parted = self.find(above), self.part(above)
+        return torch.where((n_seen > 0) & (self.find(parted) < n_before), parted, above)

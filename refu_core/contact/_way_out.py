@@ -1,4 +1,4 @@
-"""The last step of contact: vertices that the winding number finds inside the body leave it."""
+"""Vertices that the winding number finds inside the body leave it."""
 
 from __future__ import annotations
 

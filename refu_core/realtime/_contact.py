@@ -195,14 +195,25 @@ class ContactStage:
         if worn:
             done = self._part(name, done, margin=kept)
         vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
-        if self._has_room:
-            vertices = self._off_skin[name].parted(vertices, done.distance)
-        # No single step goes farther than this; together they may.
-        if was_drawn or was_torn or worn or vertices is not done.vertices:
-            vertices = pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
+        if was_drawn or was_torn or worn:
+            vertices = self._within_reach(vertices, pressed)
         if self.way_out is not None:
             vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
+        if self._has_room:
+            distance = done.distance
+            if vertices is not done.vertices:  # where they were taken out, the approximate distance had missed a limb
+                has_moved = (vertices - done.vertices).norm(dim=1) > self._settings.tolerance
+                distance = torch.where(has_moved, 0.0, distance)
+            parted = self._off_skin[name].parted(vertices, distance)
+            if parted is not vertices:
+                vertices = self._within_reach(parted, pressed)
+                if self.way_out is not None:
+                    vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
         return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
+
+    def _within_reach(self, vertices: Tensor, pressed: Tensor) -> Tensor:
+        """No single step takes vertices (V, 3) [m] farther than this; together they may."""
+        return pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
 
     def _part(self, name: str, done: Resolution, *, margin: float) -> Resolution:
         """Parts a garment that is off the body from inner ones where triangles still cut each other.
