@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import SmplBody, apply_transforms, blend_transforms
-from refu_core.fitting import Placing, SurfaceMesh, _place, _shifts, _surround, _turns, standing_pose
-from refu_core.fitting._place import UNITS, Place, find_places
+from refu_core.fitting import UNITS, Placing, SurfaceMesh, _place, _shifts, _surround, _turns, standing_pose
+from refu_core.fitting._place import Place, find_places
 from refu_core.garments import BUILTIN_GARMENTS
 
 F64 = NDArray[np.float64]

@@ -11,7 +11,6 @@ import torch
 import warp as wp
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
-from scipy.sparse.linalg import splu
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -20,7 +19,7 @@ from refu_core.backbones._decode_kernels import WIDTH, Steps, Strip, decode_kern
 from refu_core.errors import WeightsError
 from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import Connectivity
+from refu_core.mesh import Connectivity, symmetric_solver
 
 _HOLD = 100.0
 """How much more a control's own value weighs than the smoothness at a vertex."""
@@ -72,14 +71,7 @@ class Controls:
         hold[at] += _HOLD
         known = np.zeros((n, n_fields * width))
         known[at] = _HOLD * values.detach().cpu().double().numpy().transpose(1, 0, 2).reshape(n_controls, -1)
-        # The matrix is symmetric and positive; unless the solver is told so, its factors are several times as large.
-        solver = splu(
-            (bend.T @ bend + sparse.diags(hold)).tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-        field = torch.from_numpy(solver.solve(known)).float()
+        field = torch.from_numpy(symmetric_solver(bend.T @ bend + sparse.diags(hold))(known)).float()
         return field.view(n, n_fields, width).transpose(0, 1).contiguous()
 
     def matrix(self) -> Tensor:

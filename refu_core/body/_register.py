@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from refu_core.body._io import load_body
@@ -23,7 +22,7 @@ from refu_core.body._model import SmplBody
 from refu_core.body._parts import joints_of
 from refu_core.body._surface import OnSurface, Surface
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.mesh import Connectivity, vertex_normals
+from refu_core.mesh import Connectivity, symmetric_solver, vertex_normals
 
 Array = NDArray[np.float64]
 
@@ -209,6 +208,6 @@ class _Registrar:
             agree = np.clip(((normal * own).sum(1) - 0.5) / 0.4, 0, 1)
             distance2 = ((goal - at) ** 2).sum(1)
             weight = agree / (1 + distance2 / self.how.reach**2) + 1e-4
-            matrix = sparse.csc_array(sparse.diags_array(weight) + stiffness * bending)
-            at = start + splu(matrix).solve(weight[:, None] * (goal - start))
+            solve = symmetric_solver(sparse.diags_array(weight) + stiffness * bending)
+            at = start + solve(weight[:, None] * (goal - start))
         return at

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +16,13 @@ from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import no_opening
 from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._placing import UNITS, Placing
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._shifts import HIGHEST, LIFTS, heights, shifts
-from refu_core.fitting._surround import NEAR, Fit, Samples, fit_of, lies_over, parts_legs, sample
+from refu_core.fitting._surround import NEAR, Fit, Samples, fits_of, lies_over, parts_legs, sample
 from refu_core.fitting._turns import LYING, is_sideways_turn, turns_of
-from refu_core.frames import N_JOINTS
 
 F64 = NDArray[np.float64]
-
-UNITS: dict[str, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-"""Metres of a unit."""
-UP_AXES: tuple[str, ...] = ("y", "z")
 
 _SIZES = (0.12, 2.1)
 """The largest extent of a garment [m]: from a sock to a gown with a train."""
@@ -59,37 +55,6 @@ _N_REFINED = 2
 _NORMED = 1e-3
 """An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit. A
 middle this near to the origin, as a share of the extent, was made so, too: the origin says nothing of the body."""
-
-
-@dataclass(frozen=True)
-class Placing:
-    """What is known about a mesh; None for what is to be found out."""
-
-    unit: float | None = None
-    """Metres of the mesh's unit."""
-    up: str | None = None
-    """`y` or `z`."""
-    pose: F64 | None = None
-    """The pose that the mesh was modelled in: rotation vectors [rad], shape (24, 3); zeros for the T-pose."""
-    is_placed: bool = False
-    """Whether the mesh's origin is the body's; otherwise it may be moved."""
-    held_at: str | None = None
-    """A garment that is held at the `waist` doesn't reach up between the arms."""
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether nothing is left to find out."""
-        return self.is_placed and None not in (self.unit, self.up) and self.pose is not None
-
-    def __post_init__(self) -> None:
-        """Raises `GarmentError` for what is no unit, no axis or no pose."""
-        is_number = isinstance(self.unit, (int, float)) and not isinstance(self.unit, bool)
-        is_unit = self.unit is None or (is_number and 0 < self.unit < math.inf)
-        if not is_unit or self.up not in (None, *UP_AXES):
-            msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
-            raise GarmentError(msg)
-        if self.pose is not None and not (np.shape(self.pose) == (N_JOINTS, 3) and np.isfinite(self.pose).all()):
-            raise GarmentError(f"wanted a pose of {N_JOINTS} finite rotation vectors, got {self.pose!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +221,7 @@ class _Search:
 
     def too_high(self, place: Place, body: PosedBody) -> bool:
         """Whether it reaches up between the arms, where it is held at the waist, or far above the head."""
-        return place.top > min(self._highest, float(body.vertices[:, 1].max()) + _HAT)
+        return place.top > min(self._highest, body.top + _HAT)
 
     def knows(self, place: Place) -> bool:
         """Whether its unit is one that the mesh may be in."""
@@ -264,23 +229,26 @@ class _Search:
 
     def by_convention(self, bodies: list[PosedBody], turns: list[F64]) -> list[Place]:
         """The mesh where it may stand by convention, in each pose, turn and unit."""
-        return [
-            one
-            for here, turn, unit in itertools.product(bodies, turns, self._units)
-            for kind, shift in shifts(here, is_placed=self._placing.is_placed)
-            if not self.too_high(one := _at(self.samples, unit, turn, shift, here, kind), here)
-        ]
+        found = []
+        for here in bodies:
+            stands = shifts(here, is_placed=self._placing.is_placed)
+            ways = [_Way(unit, turn, *stand) for turn, unit, stand in itertools.product(turns, self._units, stands)]
+            found += [one for one in _at(self.samples, ways, here) if not self.too_high(one, here)]
+        return found
 
     def of_other_heights(self, found: list[Place], bodies: list[PosedBody]) -> list[Place]:
         """The same higher and lower: the wearer may have been taller or shorter, or the body's origin elsewhere."""
         if self._placing.is_placed:
             return []
-        lifted = [
-            _at(self.samples, one.unit, one.turn, one.shift + lift * np.eye(3)[1], here, one.kind, lift)
-            for here, one in itertools.product(bodies, found)
-            if one.pose is here.pose and one.fit.is_near and one.turn[0, 0] > 0.5 and self.shows_height(one)
-            for lift in LIFTS
-        ]
+        lifted = []
+        for here in bodies:
+            ways = [
+                _Way(one.unit, one.turn, one.kind, one.shift + lift * np.eye(3)[1], lift)
+                for one in found
+                if one.pose is here.pose and one.fit.is_near and one.turn[0, 0] > 0.5 and self.shows_height(one)
+                for lift in LIFTS
+            ]
+            lifted += _at(self.samples, ways, here)
         return [one for one in lifted if one.fit.distance < NEAR and not self.too_high(one, bodies[0])]
 
     def shows_height(self, place: Place) -> bool:
@@ -294,12 +262,14 @@ class _Search:
         few = few._replace(area=4 * few.area)
         if scales:  # there is much to try, so what nobody does is left out
             bodies, turns = bodies[:3], [turn for turn in turns if not is_sideways_turn(turn)]
-        found = [
-            one
-            for here, turn, unit in itertools.product(bodies[::2], turns, units)
-            for shift in heights(unit * self._mesh.vertices @ turn.T, here)
-            if not self.too_high(one := _at(few, unit, turn, shift, here, "searched"), here)
-        ]
+        found = []
+        for here in bodies[::2]:
+            ways = [
+                _Way(unit, turn, "searched", shift)
+                for turn, unit in itertools.product(turns, units)
+                for shift in heights(unit * self._mesh.vertices @ turn.T, here)
+            ]
+            found += [one for one in _at(few, ways, here) if not self.too_high(one, here)]
         found.sort(key=lambda one: one.cost(self._extent))
         refined = [self.refined(one, moves=True, scales=scales) for one in found[:_N_REFINED]]
         return sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
@@ -320,7 +290,7 @@ class _Search:
         steps = np.array([0.06 * scales, 0.03 * moves, 0.03 * rises, 0.03 * moves, *turning])
         free = np.flatnonzero(steps)
         middle = samples.points.mean(0) @ turn.T
-        floor = float(body.vertices[:, 1].min())
+        floor = body.floor
         extent = float(np.ptp(samples.points, axis=0).max())
 
         def at(full: F64) -> Place:
@@ -330,11 +300,11 @@ class _Search:
             unit = min(start.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
             moved = start.shift + shift + (start.unit - unit) * middle  # the middle stays as the size changes
             if start.kind == "floor":  # the floor is where the feet of this pose are
-                moved[1] += float(body.vertices[:, 1].min()) - floor
+                moved[1] += body.floor - floor
             lift = start.lift and start.lift + float(shift[1])
             held = float(np.clip(lift, -HIGHEST, HIGHEST))
             moved[1] += held - lift
-            return _at(samples, unit, turn, moved, body, start.kind, held)
+            return _at(samples, [_Way(unit, turn, start.kind, moved, held)], body)[0]
 
         def cost(full: F64) -> float:
             place = at(full)
@@ -358,10 +328,28 @@ class _Search:
         return at(there(found.x))
 
 
-def _at(samples: Samples, unit: float, turn: F64, shift: F64, body: PosedBody, kind: str, lift: float = 0.0) -> Place:
-    turned = samples._replace(normals=samples.normals @ turn.T, area=unit**2 * samples.area)
-    points = unit * samples.points @ turn.T + shift
-    return Place(unit, turn, shift, body.pose, fit_of(points, turned, body), float(points[:, 1].max()), kind, lift)
+class _Way(NamedTuple):
+    """A way to place a mesh; the fields are those of `Place`."""
+
+    unit: float
+    turn: F64
+    kind: str
+    shift: F64
+    lift: float = 0.0
+
+
+def _at(samples: Samples, ways: Sequence[_Way], body: PosedBody) -> list[Place]:
+    """The samples placed in each way on the body as it is posed."""
+    if not ways:
+        return []
+    points = np.stack([way.unit * samples.points @ way.turn.T + way.shift for way in ways])
+    normals = np.stack([samples.normals @ way.turn.T for way in ways])
+    area = np.array([[way.unit**2] for way in ways]) * samples.area
+    fits, tops = fits_of(points, normals, area, samples, body), points[:, :, 1].max(1).tolist()
+    return [
+        Place(way.unit, way.turn, way.shift, body.pose, fit, top, way.kind, way.lift)
+        for way, fit, top in zip(ways, fits, tops, strict=True)
+    ]
 
 
 def _told(place: Place) -> Place:

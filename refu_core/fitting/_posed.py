@@ -35,6 +35,8 @@ class PosedBody:
         posed = self.body.posed(torch.as_tensor(pose, dtype=torch.float32)[None], self._mean)
         self.vertices, self.transforms = posed.vertices[0], posed.transforms
         self._sdf.update(self.vertices)
+        height = self.vertices[:, 1]
+        self.floor, self.top = float(height.min()), float(height.max())
 
     def __call__(self, points: F64) -> tuple[F64, F64]:
         """Signed distance [m], shape (P,), and its unit gradient, (P, 3)."""

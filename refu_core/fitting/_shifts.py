@@ -18,8 +18,7 @@ HIGHEST = 0.15
 
 def shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:
     """Where a mesh may stand by convention: with the body's origin, or on a floor below its feet."""
-    floor = float(body.vertices[:, 1].min())
-    found = [("", np.zeros(3)), ("floor", np.array([0.0, floor, 0.0]))]
+    found = [("", np.zeros(3)), ("floor", np.array([0.0, body.floor, 0.0]))]
     return found[:1] if is_placed else found
 
 

@@ -127,41 +127,57 @@ def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
     return Samples(points, unit, is_open, label[mesh.faces[face, 0]], each)
 
 
-def fit_of(points: F64, samples: Samples, body: PosedBody) -> Fit:
-    """How well samples that are at `points` [m] surround the body; `samples.normals` in the same axes."""
-    distance, gradient = body(points)
-    outward = (samples.normals * gradient).sum(1)
+def fits_of(points: F64, normals: F64, area: F64, samples: Samples, body: PosedBody) -> list[Fit]:
+    """How well samples at N places at once surround the body: asked together, they take less than half the time.
+
+    `points` (N, P, 3) [m] and `normals` (N, P, 3) are in the body's axes, `area` (N, P) in m².
+    """
+    n_places, n_points = points.shape[:2]
+    distance, gradient = body(points.reshape(-1, 3))
+    distance = distance.reshape(n_places, n_points)
+    outward = (normals * gradient.reshape(points.shape)).sum(2)
+    is_outer = outward > 0
     # An open piece may face either way, but all of it should face the same way. A closed one has one side that faces
     # the body and one that faces away from it, and little that faces anything else.
-    pieces, open_outward = samples.piece[samples.is_open], outward[samples.is_open]
-    votes, all_votes = (np.bincount(pieces, weights) for weights in (open_outward > 0, None))
-    n_facing = np.maximum(votes, all_votes - votes).sum() + (np.abs(outward[~samples.is_open]) > _ACROSS).sum()
-    facing = float(n_facing / len(points))
-    depth = np.clip(0.01 - distance, 0, 0.05)
-    inside, off = float((distance < -0.01).mean()), float(np.clip(distance, 0, 0.6).mean())
-    around = partial(_around, points, samples, outward > 0, body.vertices.numpy(), body.skin)
-    return Fit(inside, float(depth.mean()), off, facing, around)
+    pieces, n_pieces = samples.piece[samples.is_open], int(samples.piece.max()) + 1
+    at_each = pieces + n_pieces * np.arange(n_places)[:, None]
+    votes, all_votes = (
+        np.bincount(at_each.ravel(), counted, n_places * n_pieces).reshape(n_places, n_pieces)
+        for counted in (is_outer[:, samples.is_open].ravel(), None)
+    )
+    n_facing = np.maximum(votes, all_votes - votes).sum(1) + (np.abs(outward[:, ~samples.is_open]) > _ACROSS).sum(1)
+    figures = zip(
+        (distance < -0.01).mean(1).tolist(),
+        np.clip(0.01 - distance, 0, 0.05).mean(1).tolist(),
+        np.clip(distance, 0, 0.6).mean(1).tolist(),
+        (n_facing / n_points).tolist(),
+        strict=True,
+    )
+    skin = body.vertices.numpy(), body.skin
+    return [
+        Fit(*those, partial(_around, points[k], normals[k], area[k], samples.is_open | is_outer[k], *skin))
+        for k, those in enumerate(figures)
+    ]
 
 
 def _around(
-    points: F64, samples: Samples, is_outer: NDArray[np.bool_], skin: NDArray[np.float32], skin_area: F64
+    points: F64, normals: F64, area: F64, counts: NDArray[np.bool_], skin: NDArray[np.float32], skin_area: F64
 ) -> float:
-    """Area of the skin where the samples' winding number is above 0.4, as a share of the samples' area.
+    """Area of the skin where the winding number of the samples that count is above 0.4, as a share of their area.
 
     `skin` (V, 3) [m] are the body's vertices, `skin_area` (V,) [m²] what each stands for. The inner side of a piece
-    with two sides isn't counted: the two would cancel.
+    with two sides doesn't count: the two would cancel.
     """
-    counts = samples.is_open | is_outer
     # A share of skin in whole vertices doesn't depend on a seventh digit, and single precision takes half the time.
-    places, normals, area = (array[counts].astype(np.float32) for array in (points, samples.normals, samples.area))
+    places, facing, shares = (array[counts].astype(np.float32) for array in (points, normals, area))
     each = max(1, len(skin) // _N_SKIN)
     skin = skin[::each]
     # For each vertex and sample: the way from one to the other along the normal, and its length, squared.
-    along = (places * normals).sum(1) - skin @ normals.T
+    along = (places * facing).sum(1) - skin @ facing.T
     squared = np.maximum((places**2).sum(1) + (skin**2).sum(1)[:, None] - 2 * skin @ places.T, 1e-6)
     squared *= np.sqrt(squared)  # six times as fast as the power 1.5
-    winding = (along / squared) @ area / (4 * np.pi)
-    return float(each * skin_area[::each][np.abs(winding) > 0.4].sum() / area.sum())
+    winding = (along / squared) @ shares / (4 * np.pi)
+    return float(each * skin_area[::each][np.abs(winding) > 0.4].sum() / shares.sum())
 
 
 def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
@@ -185,10 +201,16 @@ def lies_over(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
 
 def _crosses(vertices: F64, faces: NDArray[np.int64], starts: F64, ways: F64) -> bool:
     """Whether cloth lies across a line that begins at one of the starts (N, 3) and goes its way (N, 3)."""
-    corner, u, v = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
-    u, v = u - corner, v - corner
-    normal = np.cross(u, v)
+    low, high = vertices[faces[:, 0]], vertices[faces[:, 0]]
+    for k in (1, 2):
+        low, high = np.minimum(low, vertices[faces[:, k]]), np.maximum(high, vertices[faces[:, k]])
+    low, high = low.T.copy(), high.T.copy()
     for start, way in zip(starts, ways, strict=True):
+        ends = np.sort([start, start + way], axis=0)
+        near = np.flatnonzero(np.logical_and.reduce([*(low <= ends[1, :, None]), *(high >= ends[0, :, None])]))
+        corner, u, v = vertices[faces[near]].swapaxes(0, 1)
+        u, v = u - corner, v - corner
+        normal = np.cross(u, v)
         # Möller and Trumbore 1997: where the way meets each triangle's plane, and if inside it.
         steep = -(normal @ way)
         steep = np.where(np.abs(steep) < 1e-15, np.inf, steep)

@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from refu_core.fitting._clean import components, rim_vertices
 from refu_core.fitting._posed import PosedBody
-from refu_core.mesh import vertex_areas, vertex_normals
+from refu_core.mesh import symmetric_solver, vertex_areas, vertex_normals
 
 F64 = NDArray[np.float64]
 
@@ -92,15 +91,12 @@ class Transfer:
         there = (self.barycentric[:, :, None] * corners).sum(1)
         reach = length + np.abs(self.distance)
         trust = np.where(self.is_trusted, 1.0, _LEAST_TRUST) * np.maximum(self.mass, 1e-12) / reach**2
-        matrix = csc_array(self.laplacian + diags_array(trust))
         # Columns without any value, as of joints far away, needn't be solved for.
         some = np.flatnonzero(there.any(0))
         found = np.zeros((len(there), values.shape[1]))
         if len(some):
-            # The matrix is symmetric and its diagonal dominates: no pivoting, which takes forty times as long.
-            options = {"SymmetricMode": True}
-            solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-            found[:, some] = solver.solve(trust[:, None] * there[:, some])
+            solve = symmetric_solver(self.laplacian + diags_array(trust))
+            found[:, some] = solve(trust[:, None] * there[:, some])
         for piece in self.rigid:
             found[piece] = found[piece].mean(0)
         return found

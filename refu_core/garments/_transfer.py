@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from refu_core.body import BodyFit, Surface, load_body
 from refu_core.frames import N_BETAS
 from refu_core.garments._template import GarmentTemplate
+from refu_core.mesh import symmetric_solver
 
 Array = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class _Carrier:
         self._attach = sparse.csr_array((weight.ravel(), (rows, vertex.ravel())), shape=(len(rest), len(skin)))
         self._hold = 1 / (1 + (distance[:, 0] / _HELD_WITHIN) ** 2) ** 2
         bending = garment.mesh.uniform_laplacian()
-        self._solve = splu(sparse.csc_array(sparse.diags_array(self._hold) + _STIFFNESS * bending.T @ bending)).solve
+        self._solve = symmetric_solver(sparse.diags_array(self._hold) + _STIFFNESS * bending.T @ bending)
 
     def __call__(self, values: Array) -> Array:
         """`values` of the skin's vertices (V, …), carried over to the garment's (N, …)."""

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
-from scipy.sparse.linalg import splu
 
 from refu_core._cache import keep, recall
 from refu_core._warp import as_warp, ints
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import vertex_normals
+from refu_core.mesh import symmetric_solver, vertex_normals
 from refu_core.observation._match_kernels import match_kernel
 
 F32 = NDArray[np.float32]
@@ -104,7 +103,7 @@ def _subspace(garment: GarmentTemplate, count: int) -> tuple[NDArray[np.float64]
     adjacent = garment.mesh.adjacency_matrix()
     n = garment.n_vertices
     laplacian = csc_array(diags_array(adjacent.sum(axis=1)) - adjacent)
-    solve = splu((laplacian + _LOWEST * eye_array(n)).tocsc()).solve
+    solve = symmetric_solver(laplacian + _LOWEST * eye_array(n))
     block = np.random.default_rng(0).normal(size=(n, min(count + _SPARE, n)))
     for _ in range(_ITERATIONS):
         block, _ = np.linalg.qr(solve(solve(block)))

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_array, diags_array, eye_array
 
 from refu_core._cache import keep, recall
 from refu_core.body import Surface
 from refu_core.errors import MeshError
 from refu_core.frames import SmplFrame
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import Connectivity, as_points, rim_of, vertex_areas
+from refu_core.mesh import Connectivity, as_points, rim_of, symmetric_solver, vertex_areas
 from refu_core.outputs._simplify import simplify
 from refu_core.realtime import GarmentPipeline
 from refu_core.skeleton import posed
@@ -106,7 +105,7 @@ def _drawn(sheet_points: Points, sheet: NDArray[np.int32], cloth: Points, faces:
         by_sheet = samples.T * (_distance(asked - goal) / len(asked))
         normal = by_cloth @ place + by_sheet @ samples
         tether = (_TETHER * normal.diagonal().mean()) * firm
-        points = splu(csc_array(normal + tether)).solve(by_cloth @ cloth + by_sheet @ goal + tether @ points)
+        points = symmetric_solver(normal + tether)(by_cloth @ cloth + by_sheet @ goal + tether @ points)
     return points
 
 

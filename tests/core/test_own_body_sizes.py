@@ -54,15 +54,15 @@ def test_folds_are_as_large_as_the_body() -> None:
     """Networks have learnt them from adults."""
     frame = SmplFrame(0.3 * np.sin(np.arange(72.0)).reshape(24, 3))
     draped = []
-    for tall in (0.6, 1.5):
+    for tall in (0.58, 1.5):  # which other tests have registered, too
         pipeline = GarmentPipeline.load(["tshirt-male"], body=sized(tall), sdf="none")
         skinned = GarmentPipeline.load(["tshirt-male"], body=sized(tall), sdf="none", backbone="skinned")
         draped.append(pipeline(frame)["tshirt-male"].raw - skinned(frame)["tshirt-male"].raw)
     assert np.abs(draped[1]).max() > 20 * MM
-    assert np.abs(draped[0] - 0.4 * draped[1]).max() < 3 * MM
+    assert np.abs(draped[0] - 0.58 / 1.5 * draped[1]).max() < 3 * MM
 
 
-@pytest.mark.parametrize("tall", [0.58, 1.7])
+@pytest.mark.parametrize("tall", [0.58, 1.5])
 @pytest.mark.parametrize(("mean", "far", "poor"), [(1.0, 9.0, False), (1.0, 11.0, True), (3.1, 5.0, True)])
 def test_how_well_it_lies_is_judged_by_the_bodys_size(tall: float, mean: float, far: float, poor: bool) -> None:
     """And by the farthest points, too [mm on an adult]."""

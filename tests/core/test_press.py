@@ -45,7 +45,7 @@ def made(body: Tensor, sweeps: int = DEFAULT_CONTACT.around, *, knows_arms: bool
 
 
 def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of points (N, 3) from the closest of triangles (F, 3, 3), by closest points of all of them."""
+    """Of points (N, 3) from the closest of triangles (F, 3, 3), by closest points of all of them; inf of none."""
     a, ab, ac = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     found = np.empty(len(points))
     for i, point in enumerate(points):
@@ -64,7 +64,7 @@ def distances(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> ND
         nearest = np.min(on_edges, axis=0)
         is_within = (u >= 0) & (v >= 0) & (u + v <= 1)
         nearest[is_within] = np.linalg.norm(from_a - u[:, None] * ab - v[:, None] * ac, axis=1)[is_within]
-        found[i] = nearest.min()
+        found[i] = nearest.min(initial=np.inf)
     return found
 
 
@@ -87,7 +87,11 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool, was_pushed: bool) -
         farthest, room, slack = how.gap, how.gap / 2, how.tolerance
     near = np.flatnonzero((moved > 0) | (np.arange(len(x)) % 40 == 0))
     height = np.linalg.norm(x - at, axis=1)
-    arms = [body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]] for arm in (1, 2)]
+    arms = []
+    for arm in (1, 2):
+        triangles = body.double().numpy()[outfit().body.faces.numpy()[of_face == arm]]
+        middle = triangles.mean(1)
+        arms.append((triangles, middle, np.linalg.norm(triangles - middle[:, None], axis=2).max(1)))
     wanted = x.copy()
     for v in near:
         h, whole = height[v], height[v] + room
@@ -95,8 +99,9 @@ def test_is_what_a_look_from_the_skin_says(knows_arms: bool, was_pushed: bool) -
             continue
         aside = min(farthest, 2 * h * h / how.limb_reach)
         least = whole
-        for triangles in arms:
+        for arm, middle, radius in arms:
             go = 0.0
+            triangles = arm[np.linalg.norm(middle - at[v], axis=1) - radius < whole + aside]  # others don't count
             while go < least:
                 off = distances((at[v] + go / h * (x[v] - at[v]))[None], triangles)[0]
                 off = min(off, aside * (least - go) / (whole - go))

@@ -36,16 +36,16 @@ def strains(points: Tensor, rest: Tensor, edges: NDArray[np.int32]) -> NDArray[n
 
 
 def slow(points: Tensor, rest: Tensor, mesh: Connectivity, sweeps: int) -> Tensor:
-    """Edge by edge, as it is written."""
+    """Edge by edge, as it is written; a sweep's edges don't know of each other."""
     x, r = points.double().numpy().copy(), rest.double().numpy()
+    i, j = mesh.edges.T
+    longest = LIMIT * np.linalg.norm(r[j] - r[i], axis=1)
     for _ in range(sweeps):
-        total = np.zeros_like(x)
-        for i, j in mesh.edges:
-            way = x[j] - x[i]
-            length, longest = np.linalg.norm(way), LIMIT * np.linalg.norm(r[j] - r[i])
-            if length > longest:
-                total[i] += 0.5 * (length - longest) / length * way
-                total[j] -= 0.5 * (length - longest) / length * way
+        total, way = np.zeros_like(x), x[j] - x[i]
+        length = np.linalg.norm(way, axis=1)
+        half = (0.5 * (length - longest).clip(0) / length)[:, None] * way
+        np.add.at(total, i, half)
+        np.add.at(total, j, -half)
         x += total / np.diff(mesh.ring.start)[:, None]
     return torch.tensor(x)
 
