@@ -9,6 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -348,6 +349,31 @@ def test_a_bug_is_one_line_and_shows_where_it_is_when_asked(
     monkeypatch.setenv("REFU_DEBUG", "1")
     assert main(["info"]) == cli.EXIT_BUG
     assert "in collect" in capsys.readouterr().err
+
+
+class Interrupting:
+    """What is interrupted while it goes: an array of Warp's, for instance."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self._number = number
+
+    def __del__(self) -> None:
+        signal.raise_signal(self._number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_is_not_lost_in_a_destructor(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python printed it, and the replay went on until the node killed it."""
+
+    def collect() -> None:
+        Interrupting(number)
+        time.sleep(60)
+
+    monkeypatch.setattr("refu_lab.info.collect", collect)
+    assert main(["info"]) == cli.EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "refu: interrupted\n"
 
 
 @dataclass
