@@ -345,14 +345,15 @@ def scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple
         )
         for kind, options in (
             ("dask_scheduler", ["--no-dashboard", "--host", "127.0.0.1", "--port", "0"]),
-            ("dask_worker", ["--nworkers", "2", "--nthreads", "1", "--no-dashboard", "--death-timeout", "60"]),
+            ("dask_worker", ["--nworkers", "2", "--nthreads", "1", "--no-dashboard", "--death-timeout", "300"]),
         )
     ]
     try:
-        deadline = time.monotonic() + 120
-        while not file.exists() and time.monotonic() < deadline:
+        deadline, found = time.monotonic() + 300, ""
+        while not found.endswith("}") and time.monotonic() < deadline:  # it is there before all is in it
             time.sleep(0.05)
-        yield json.loads(file.read_text())["address"], started[0]
+            found = file.read_text() if file.exists() else ""
+        yield json.loads(found)["address"], started[0]
     finally:
         for process in started:
             os.killpg(process.pid, signal.SIGKILL)  # with what they have started

@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,8 @@ class Forked:
     def send_signal(self, number: int) -> None:
         """To it, if it still runs."""
         if self.poll() is None:
-            os.kill(self.pid, number)
+            with suppress(ProcessLookupError):  # it has just ended
+                os.kill(self.pid, number)
 
     def terminate(self) -> None:
         """Asks it to end."""
@@ -71,12 +73,21 @@ def _parent() -> subprocess.Popen[str]:
 
 
 def run_program(
-    name: str, arguments: list[str], *, log: Path, cwd: Path | None = None, path: Sequence[str] = ()
+    name: str, arguments: list[str], *, log: Path, cwd: Path | None = None, path: Sequence[str] = (), first: str = ""
 ) -> Forked:
-    """`garment_node` or `smpl_publisher` in this environment; writes to `log`, and finds modules in `path` first."""
+    """`garment_node` or `smpl_publisher` in this environment; writes to `log`, and finds modules in `path` first.
+
+    What is in `first`, in Python, is done before the program begins.
+    """
     log.write_bytes(b"")
     status = log.with_name(f"{log.name}.status-{time.monotonic_ns()}")
-    order = {"program": [name, *arguments], "log": str(log), "cwd": str(cwd or Path.cwd()), "path": [*path]}
+    order = {
+        "program": [name, *arguments],
+        "log": str(log),
+        "cwd": str(cwd or Path.cwd()),
+        "path": [*path],
+        "first": first,
+    }
     parent = _parent()
     assert parent.stdin is not None
     assert parent.stdout is not None
@@ -122,6 +133,7 @@ def _serve() -> None:
             sys.path[:0] = order["path"]
             sys.argv = order["program"]
             gc.freeze = lambda: None  # a node that is out of the collector's sight would be on the graph for 20 s more
+            exec(order["first"], {})
             code = sys.modules[f"refu_ros.{sys.argv[0]}"].main()
             atexit._run_exitfuncs()
             gc.collect()  # what leaves the graph with its end

@@ -7,6 +7,7 @@ import select
 import signal
 import subprocess
 import sys
+from collections import defaultdict
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame
-from rcl_interfaces.srv import GetParameters
+from rcl_interfaces.msg import ParameterEvent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,14 +58,18 @@ def test_a_clock_set_back_is_reported_and_everybody_stays_dressed(scene: Peer) -
 
 
 def test_a_body_that_cannot_be_loaded_is_taken_back(scene: Peer, tmp_path: Path) -> None:
-    def body() -> str:
-        request = GetParameters.Request(names=["body"])
-        return str(scene.call(GetParameters, "garment_node/get_parameters", request).values[0].string_value)
+    values: dict[str, list[str]] = defaultdict(list)
 
+    def heard(event: ParameterEvent) -> None:
+        for one in event.changed_parameters:
+            values[one.name].append(one.value.string_value)
+
+    scene.node.create_subscription(ParameterEvent, "/parameter_events", heard, 10)
+    scene.spin_until(lambda: scene.set(frame_id="map") and values["frame_id"], "what is set is heard of")
     (tmp_path / "body.npz").write_bytes(b"no body")
     assert scene.set(body=str(tmp_path / "body.npz"))[0].successful  # it is loaded beside the stream
-    assert body()
-    scene.spin_until(lambda: not body(), "the parameter says again what is worn")
+    wanted = [str(tmp_path / "body.npz"), ""]
+    scene.spin_until(lambda: values["body"] == wanted, "the parameter says again what is worn")
     for i, garment in enumerate((GARMENTS[1], GARMENTS[0])):
         assert scene.set(garments=[garment])[0].successful
         scene.garments.clear()

@@ -85,6 +85,7 @@ def _is_of(message: Any, sent: SmplFrame) -> bool:
 def robot(ros: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Robot]]:  # noqa: ARG001
     """Makes robots."""
     monkeypatch.setattr("refu_ros._listener._GRACE_S", 0.0)
+    monkeypatch.setattr("refu_ros._node._BEAT_S", 0.2)
     made: list[Robot] = []
 
     def make(*persons: str, **parameters: Any) -> Robot:
@@ -394,7 +395,7 @@ def test_a_cameras_frame_is_written_to_the_log_without_its_control_characters(
         said += capfd.readouterr().err
         return "if they are the same place" in said
 
-    scene.until(warned, "it is warned of", timeout=20)
+    scene.until(warned, "it is warned of")
     assert "\x1b" not in said
     assert "eye\\x1b[2J" in said
 
