@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import resource
@@ -252,22 +253,14 @@ def test_output_that_cannot_be_written_is_one_line() -> None:
     assert (done.returncode, done.stderr) == (2, "refu: error: [Errno 28] No space left on device\n")
 
 
-def test_a_terminal_without_arrows_gets_the_rest() -> None:
-    options = [
-        "--max-frames",
-        "1",
-        "--garments",
-        "short-pant-male",
-        "--backbone",
-        "skinned",
-        "--sdf",
-        "none",
-        "--quiet",
-    ]
-    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
-    done = subprocess.run([*REFU, "replay", BAG, *options], env=environment, capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert b"before ? after collision handling" in b" ".join(done.stdout.split())
+def test_a_terminal_without_arrows_gets_the_rest(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = "--max-frames 1 --garments short-pant-male --backbone skinned --sdf none --quiet"
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding="latin-1"))
+    assert main(["replay", BAG, *options.split()]) == 0
+    assert b"before ? after collision handling" in b" ".join(sys.stdout.buffer.getvalue().split())  # type: ignore[attr-defined]
+    assert capsys.readouterr().err == ""
 
 
 def test_an_interrupt_while_imports_run_leaves_no_traceback() -> None:

@@ -308,15 +308,6 @@ def test_conversion_alone_gives_the_same_bag(bags: Path, alone: Path, tmp_path: 
     assert run(bag, "--no-evaluate", "--report", tmp_path / "report") == 2
 
 
-def test_dask_is_not_imported_unless_asked_for(bags: Path) -> None:
-    code = (
-        "import sys; from refu_lab.cli import main\n"
-        f"code = main(['replay', {str(bags / 'a')!r}, *{FAST!r}])\n"
-        "assert code == 0 and not {'dask', 'distributed', 'tornado'} & set(sys.modules), sorted(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
-
-
 def test_without_dask_one_line_says_what_to_install(bags: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr("refu_lab.fleet._engine.find_spec", lambda _: None)
     assert run(bags, "--jobs", "2") == 2
@@ -334,6 +325,7 @@ def scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple
     pytest.importorskip("distributed")
     file = tmp_path / "scheduler.json"
     monkeypatch.setenv("REFU_TEST_MARK", str(tmp_path / "mark"))
+    monkeypatch.setattr("refu_lab.fleet._engine.CONNECT_S", 300.0)  # a busy machine's answers late
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     started = [
         subprocess.Popen(
