@@ -1,7 +1,8 @@
 """Programs that begin at once: a process that has imported what they import, and forks one for each that asks.
 
-To import torch takes seconds, and some forty programs are started by the tests. Nothing but modules is shared: rclpy is
-started, and warp, by each for itself. And they say five times a second how they are, not once: tests wait for that.
+To import torch takes seconds, to load kernels one more, and some forty programs are started by the tests. Nothing but
+modules and kernels is shared: rclpy is started by each for itself. And they say five times a second how they are, not
+once: tests wait for that.
 """
 
 from __future__ import annotations
@@ -98,9 +99,11 @@ def run_program(
 
 def _serve() -> None:
     """Forks until there is nobody to ask any more."""
-    from refu_ros import _node, _worker, garment_node, smpl_publisher  # noqa: F401  (and all that they import)
+    from refu_ros import _beside, _node, _worker, garment_node, smpl_publisher  # noqa: F401  (and all that they import)
+    from refu_ros._settings import NodeSettings
 
     _node._BEAT_S = 0.2
+    _beside.load(NodeSettings(garments=("tshirt-male",)))  # with most kernels of most nodes
     gc.freeze()  # a collector that goes through all of it would copy it, too
     running: dict[int, Path] = {}
 

@@ -282,7 +282,8 @@ def test_the_guide_names_the_qualities_that_can_be_overridden() -> None:
 
 
 def test_the_program_rests_after_some_seconds(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
-    with NodeProcess(tmp_path / "log.txt", **CHEAP) as node:
+    soon = "from refu_ros import _listener; _listener._GRACE_S = 1.0"
+    with NodeProcess(tmp_path / "log.txt", first=soon, **CHEAP) as node:
         peer = Peer()
         peer.wait_for_node()
         peer.dress(frame(1))
