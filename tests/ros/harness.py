@@ -275,10 +275,13 @@ class NodeHere:
         self._executor.remove_node(self.node)
         self.node.close()
         self.node.destroy_node()
-        node = weakref.ref(self.node)
+        node, executor, end = weakref.ref(self.node), self._executor, begun + PATIENCE_S
         del self.node, self._executor
         gc.collect()  # only then is the node gone from the graph
-        assert node() is None
+        while node() is not None:  # something came after the last look
+            assert time.monotonic() < end, "something holds the node"
+            executor.spin_once(timeout_sec=_QUIET_S)
+            gc.collect()
 
 
 def frame(i: int, *, stamp_ns: int | None = None, transl: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SmplFrame:
