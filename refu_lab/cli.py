@@ -9,10 +9,11 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; more threads would wait for busy cores
 
@@ -46,8 +47,38 @@ def _parser() -> Parser:
     return parser
 
 
+_AGAIN_S = 0.01
+"""After so long an interrupt comes again that was raised in a destructor, where Python only prints it [s]."""
+
+
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """A terminated command closes its files like an interrupted one, and no interrupt is lost."""
+    hook = sys.unraisablehook
+
+    def come_again(_signal: int, _frame: FrameType | None) -> None:
+        signal.raise_signal(signal.SIGTERM)  # handled as it is then: it may have to wait for the end of a message
+
+    def unraised(what: Any) -> None:
+        if what.exc_type is KeyboardInterrupt:
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        else:
+            hook(what)
+
+    handlers = {signal.SIGTERM: _interrupt, signal.SIGALRM: come_again}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    sys.unraisablehook = unraised
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,7 +87,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal or file that has no → gets a ?
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it can't write to
-    before = signal.signal(signal.SIGTERM, _interrupt)  # a terminated replay closes its bag like an interrupted one
+    with _interruptible():
+        return _run(arguments)
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     try:
         try:
             args = _parser().parse_args(arguments)
@@ -91,7 +126,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         what = f"{type(error).__name__}: {error}"
         return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", EXIT_BUG)
     finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
         _drop_unwritable()
     return code
 

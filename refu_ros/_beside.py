@@ -76,25 +76,26 @@ class PipelineLoader:
         threads: int,
     ) -> None:
         self._use, self._fail, self._threads = use, fail, threads
-        self._wanted: PipelineOptions | None = None
+        self.wanted: PipelineOptions | None = None
+        """What was asked for last."""
         self._pool = ThreadPoolExecutor(1, "loader")
 
     def request(self, options: PipelineOptions) -> None:
         """Asks for a pipeline; returns at once."""
-        self._wanted = options
+        self.wanted = options
         self._pool.submit(self._load, options)
 
     def close(self) -> None:
         """Ends the thread, after the load under way."""
-        self._wanted = None
+        self.wanted = None
         self._pool.shutdown()
 
     def _load(self, options: PipelineOptions) -> None:
-        if options is not self._wanted:
+        if options is not self.wanted:
             return
         try:
             fittings = load(options, threads=self._threads)
-            if options is self._wanted:
+            if options is self.wanted:
                 self._use(fittings, options)
         except Exception as error:  # missing weights, no CUDA: the running pipeline stays
             self._fail(error, options)

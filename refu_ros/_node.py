@@ -286,9 +286,13 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self._refused = key
 
     def _take_back(self) -> None:
-        """Sets the parameters back to the pipeline in use, if the one they ask for can't be loaded."""
+        """Sets the parameters back to the pipeline in use, if the one they ask for can't be loaded.
+
+        If it has been asked for again meanwhile, it is tried again.
+        """
         refused, self._refused = self._refused, None
-        if refused is not None and self._in_use is not None and refused == self.settings.pipeline:
+        is_newest = self._loader is not None and refused is self._loader.wanted
+        if is_newest and self._in_use is not None and refused == self.settings.pipeline:
             used = {name: getattr(self._in_use, name) for name in PIPELINE_OPTIONS}
             changed = {name: value for name, value in used.items() if value != getattr(refused, name)}
             self.set_parameters([parameter(name, value) for name, value in changed.items()])

@@ -17,6 +17,7 @@ import sysconfig
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,6 +81,8 @@ def build(folder: Path) -> None:
 def _generate(code: Path, share: Path) -> None:
     """rosidl's C, type support and Python, from the definitions; a folder for each."""
     adapter = importlib.import_module("rosidl_adapter")
+    parser: Any = importlib.import_module("rosidl_parser.parser")
+    parser.get_ast_from_idl_string = cache(parser.get_ast_from_idl_string)  # else each generator parses each file
     for path in definitions():
         adapter.convert_to_idl(SOURCE, PACKAGE, path.relative_to(SOURCE), code / "idl")
     files = [f"{code / 'idl'}:{path.relative_to(SOURCE).with_suffix('.idl')}" for path in definitions()]

@@ -34,7 +34,7 @@ _FLAGS = (
     "--hide-scrollbars",
     "--remote-debugging-port=0",
 )
-_LONG_S = 120.0
+_LONG_S = 300.0
 """A machine may be busy; what is waited for comes in a second or two."""
 
 
@@ -50,9 +50,11 @@ class Browser:
         assert self._process.stderr is not None
         found = (re.search(r"DevTools listening on ws://([^/]+)/", line) for line in self._process.stderr)
         self._address = next(match[1] for match in found if match)
-        pages = json.load(urllib.request.urlopen(f"http://{self._address}/json"))
-        (page,) = (one for one in pages if one["type"] == "page")
-        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None)
+        pages: list[dict[str, str]] = []
+        while not pages:  # it listens before it has one
+            there = json.load(urllib.request.urlopen(f"http://{self._address}/json", timeout=_LONG_S))
+            pages = [one for one in there if one["type"] == "page"]
+        self._socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=None, open_timeout=_LONG_S)
         self._number = 0
         self.errors: list[str] = []
         """What the page has thrown, and what it couldn't load."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import resource
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -251,22 +253,14 @@ def test_output_that_cannot_be_written_is_one_line() -> None:
     assert (done.returncode, done.stderr) == (2, "refu: error: [Errno 28] No space left on device\n")
 
 
-def test_a_terminal_without_arrows_gets_the_rest() -> None:
-    options = [
-        "--max-frames",
-        "1",
-        "--garments",
-        "short-pant-male",
-        "--backbone",
-        "skinned",
-        "--sdf",
-        "none",
-        "--quiet",
-    ]
-    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
-    done = subprocess.run([*REFU, "replay", BAG, *options], env=environment, capture_output=True, check=False)
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert b"before ? after collision handling" in b" ".join(done.stdout.split())
+def test_a_terminal_without_arrows_gets_the_rest(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = "--max-frames 1 --garments short-pant-male --backbone skinned --sdf none --quiet"
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding="latin-1"))
+    assert main(["replay", BAG, *options.split()]) == 0
+    assert b"before ? after collision handling" in b" ".join(sys.stdout.buffer.getvalue().split())  # type: ignore[attr-defined]
+    assert capsys.readouterr().err == ""
 
 
 def test_an_interrupt_while_imports_run_leaves_no_traceback() -> None:
@@ -348,6 +342,31 @@ def test_a_bug_is_one_line_and_shows_where_it_is_when_asked(
     monkeypatch.setenv("REFU_DEBUG", "1")
     assert main(["info"]) == cli.EXIT_BUG
     assert "in collect" in capsys.readouterr().err
+
+
+class Interrupting:
+    """What is interrupted while it goes: an array of Warp's, for instance."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self._number = number
+
+    def __del__(self) -> None:
+        signal.raise_signal(self._number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_is_not_lost_in_a_destructor(
+    number: signal.Signals, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python printed it, and the replay went on until the node killed it."""
+
+    def collect() -> None:
+        Interrupting(number)
+        time.sleep(60)
+
+    monkeypatch.setattr("refu_lab.info.collect", collect)
+    assert main(["info"]) == cli.EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "refu: interrupted\n"
 
 
 @dataclass

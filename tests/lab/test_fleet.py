@@ -308,15 +308,6 @@ def test_conversion_alone_gives_the_same_bag(bags: Path, alone: Path, tmp_path: 
     assert run(bag, "--no-evaluate", "--report", tmp_path / "report") == 2
 
 
-def test_dask_is_not_imported_unless_asked_for(bags: Path) -> None:
-    code = (
-        "import sys; from refu_lab.cli import main\n"
-        f"code = main(['replay', {str(bags / 'a')!r}, *{FAST!r}])\n"
-        "assert code == 0 and not {'dask', 'distributed', 'tornado'} & set(sys.modules), sorted(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
-
-
 def test_without_dask_one_line_says_what_to_install(bags: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr("refu_lab.fleet._engine.find_spec", lambda _: None)
     assert run(bags, "--jobs", "2") == 2
@@ -334,6 +325,7 @@ def scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple
     pytest.importorskip("distributed")
     file = tmp_path / "scheduler.json"
     monkeypatch.setenv("REFU_TEST_MARK", str(tmp_path / "mark"))
+    monkeypatch.setattr("refu_lab.fleet._engine.CONNECT_S", 300.0)  # a busy machine's answers late
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     started = [
         subprocess.Popen(
@@ -345,14 +337,15 @@ def scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple
         )
         for kind, options in (
             ("dask_scheduler", ["--no-dashboard", "--host", "127.0.0.1", "--port", "0"]),
-            ("dask_worker", ["--nworkers", "2", "--nthreads", "1", "--no-dashboard", "--death-timeout", "60"]),
+            ("dask_worker", ["--nworkers", "2", "--nthreads", "1", "--no-dashboard", "--death-timeout", "300"]),
         )
     ]
     try:
-        deadline = time.monotonic() + 120
-        while not file.exists() and time.monotonic() < deadline:
+        deadline, found = time.monotonic() + 300, ""
+        while not found.endswith("}") and time.monotonic() < deadline:  # it is there before all is in it
             time.sleep(0.05)
-        yield json.loads(file.read_text())["address"], started[0]
+            found = file.read_text() if file.exists() else ""
+        yield json.loads(found)["address"], started[0]
     finally:
         for process in started:
             os.killpg(process.pid, signal.SIGKILL)  # with what they have started

@@ -24,6 +24,7 @@ from refu_lab.commands.garment import AddOptions
 from refu_lab.export import ExportMesh, meshes_of, write_meshes
 from refu_lab.garment import add_garment, list_garments, warnings_of
 from refu_ros._settings import NodeSettings
+from tests.lab.test_own_body_commands import HURRIED
 
 ROOT = Path(__file__).parents[2]
 WALK = ROOT / "bags" / "walk"
@@ -196,7 +197,7 @@ def test_a_node_takes_a_garment_by_its_path(template: GarmentTemplate, tmp_path:
 def test_a_garment_of_ones_own_is_simulated_and_trained(template: GarmentTemplate, tmp_path: Path) -> None:
     """The whole journey with few samples: a mesh, cloth, networks, and those in the pipeline."""
     path = save_garment(template, tmp_path / "kilt.npz")
-    card = simulate_dataset(str(path), 2, tmp_path / "simulated", test_share=0.5)
+    card = simulate_dataset(str(path), 2, tmp_path / "simulated", test_share=0.5, settings=HURRIED)
     assert card["counts"]["to_do"] == 0
     data = write_set(tmp_path / "set", template, load_body("female"))
     settings = PretrainSettings.of("mlp", "realtime")

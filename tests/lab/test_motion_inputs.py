@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from refu_lab.report import write_report
 ROOT = Path(__file__).parents[2]
 Z_UP = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
 PLAIN: dict[str, Any] = {"garments": ("short-pant-male",), "backbone": "skinned", "sdf": "none", "collider": False}
-FRAMES = [record.frame for record in adapters.iter_smpl_frames(ROOT / "bags" / "walk") if record.frame][:8]
+FRAMES = [*islice((one.frame for one in adapters.iter_smpl_frames(ROOT / "bags" / "walk") if one.frame), 8)]
 
 
 def z_up(path: Path, **changes: Any) -> Path:

@@ -467,10 +467,13 @@ def test_pages_of_other_sites_are_not_served() -> None:
     try:
         port, spoken = server.get_port(), [f"viser-v{viser.__version__}"]
         for origin in (f"http://localhost:{port}", "http://127.0.0.1:9090", None):
-            with connect(f"ws://localhost:{port}", origin=origin, subprotocols=spoken) as page:
-                assert page.recv(timeout=10)
+            with connect(f"ws://localhost:{port}", origin=origin, subprotocols=spoken, open_timeout=300) as page:
+                assert page.recv(timeout=300)
         for origin in ("https://evil.example", f"http://localhost.evil.example:{port}", "null"):
-            with pytest.raises(InvalidStatus, match="403"), connect(f"ws://localhost:{port}", origin=origin):
+            with (
+                pytest.raises(InvalidStatus, match="403"),
+                connect(f"ws://localhost:{port}", origin=origin, open_timeout=300),
+            ):
                 pass
     finally:
         server.stop()

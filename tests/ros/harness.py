@@ -8,8 +8,6 @@ import functools
 import gc
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
 import weakref
@@ -33,7 +31,7 @@ from refu_core import SmplFrame
 from refu_ros import garment_node
 from refu_ros._node import GarmentNode
 from refu_ros._program import make_executor
-from tests.ros.ready import Forked, run_program
+from tests.ros.ready import run_program
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,8 +49,6 @@ _TURN_S = 0.02
 """How long a node in the tests' process, and then its peer, does what there is to do, until the test looks again."""
 _QUIET_S = 0.05
 """After so long without anything to do an executor has nothing left to do."""
-_LAST_WORDS_S = 20.0
-"""A node that is told to end is killed after this time."""
 
 
 class NodeProcess:
@@ -62,7 +58,7 @@ class NodeProcess:
         self,
         log: Path,
         *,
-        program: str = "",
+        first: str = "",
         packages: Path | None = None,
         namespace: str = "",
         **parameters: Any,
@@ -71,15 +67,7 @@ class NodeProcess:
         given = [*ros_arguments(parameters), "-r", f"__ns:=/{namespace}"]
         path = [str(folder) for folder in (ROOT, packages) if folder is not None]
         cwd = log.parent  # of relative paths that a test or a hostile peer names
-        self.process: Forked | subprocess.Popen[bytes]
-        if not program:
-            self.process = run_program("garment_node", given, log=log, cwd=cwd, path=path)
-            return
-        environment = {**os.environ, "PYTHONPATH": ":".join([*path, os.environ.get("PYTHONPATH", "")])}
-        with log.open("wb") as file:
-            self.process = subprocess.Popen(
-                [sys.executable, "-c", program, *given], cwd=cwd, env=environment, stdout=file, stderr=file
-            )
+        self.process = run_program("garment_node", given, log=log, cwd=cwd, path=path, first=first)
 
     def __enter__(self) -> NodeProcess:
         return self
@@ -88,10 +76,9 @@ class NodeProcess:
         # One that is killed is there for the others for twenty seconds more: the next test would talk to it.
         self.process.terminate()
         try:
-            self.process.wait(_LAST_WORDS_S)
-        except subprocess.TimeoutExpired:
+            self.process.wait(PATIENCE_S)
+        finally:
             self.process.kill()
-            self.process.wait()
 
     @property
     def log(self) -> str:
@@ -288,10 +275,13 @@ class NodeHere:
         self._executor.remove_node(self.node)
         self.node.close()
         self.node.destroy_node()
-        node = weakref.ref(self.node)
+        node, executor, end = weakref.ref(self.node), self._executor, begun + PATIENCE_S
         del self.node, self._executor
         gc.collect()  # only then is the node gone from the graph
-        assert node() is None
+        while node() is not None:  # something came after the last look
+            assert time.monotonic() < end, "something holds the node"
+            executor.spin_once(timeout_sec=_QUIET_S)
+            gc.collect()
 
 
 def frame(i: int, *, stamp_ns: int | None = None, transl: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> SmplFrame:

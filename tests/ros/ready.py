@@ -1,7 +1,8 @@
 """Programs that begin at once: a process that has imported what they import, and forks one for each that asks.
 
-To import torch takes seconds, and some forty programs are started by the tests. Nothing but modules is shared: rclpy is
-started, and warp, by each for itself. And they say five times a second how they are, not once: tests wait for that.
+To import torch takes seconds, to load kernels one more, and some forty programs are started by the tests. Nothing but
+modules and kernels is shared: rclpy is started by each for itself. And they say five times a second how they are, not
+once: tests wait for that.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +47,8 @@ class Forked:
     def send_signal(self, number: int) -> None:
         """To it, if it still runs."""
         if self.poll() is None:
-            os.kill(self.pid, number)
+            with suppress(ProcessLookupError):  # it has just ended
+                os.kill(self.pid, number)
 
     def terminate(self) -> None:
         """Asks it to end."""
@@ -71,12 +74,21 @@ def _parent() -> subprocess.Popen[str]:
 
 
 def run_program(
-    name: str, arguments: list[str], *, log: Path, cwd: Path | None = None, path: Sequence[str] = ()
+    name: str, arguments: list[str], *, log: Path, cwd: Path | None = None, path: Sequence[str] = (), first: str = ""
 ) -> Forked:
-    """`garment_node` or `smpl_publisher` in this environment; writes to `log`, and finds modules in `path` first."""
+    """`garment_node` or `smpl_publisher` in this environment; writes to `log`, and finds modules in `path` first.
+
+    What is in `first`, in Python, is done before the program begins.
+    """
     log.write_bytes(b"")
     status = log.with_name(f"{log.name}.status-{time.monotonic_ns()}")
-    order = {"program": [name, *arguments], "log": str(log), "cwd": str(cwd or Path.cwd()), "path": [*path]}
+    order = {
+        "program": [name, *arguments],
+        "log": str(log),
+        "cwd": str(cwd or Path.cwd()),
+        "path": [*path],
+        "first": first,
+    }
     parent = _parent()
     assert parent.stdin is not None
     assert parent.stdout is not None
@@ -87,9 +99,11 @@ def run_program(
 
 def _serve() -> None:
     """Forks until there is nobody to ask any more."""
-    from refu_ros import _node, _worker, garment_node, smpl_publisher  # noqa: F401  (and all that they import)
+    from refu_ros import _beside, _node, _worker, garment_node, smpl_publisher  # noqa: F401  (and all that they import)
+    from refu_ros._settings import NodeSettings
 
     _node._BEAT_S = 0.2
+    _beside.load(NodeSettings(garments=("tshirt-male",)))  # with most kernels of most nodes
     gc.freeze()  # a collector that goes through all of it would copy it, too
     running: dict[int, Path] = {}
 
@@ -122,6 +136,7 @@ def _serve() -> None:
             sys.path[:0] = order["path"]
             sys.argv = order["program"]
             gc.freeze = lambda: None  # a node that is out of the collector's sight would be on the graph for 20 s more
+            exec(order["first"], {})
             code = sys.modules[f"refu_ros.{sys.argv[0]}"].main()
             atexit._run_exitfuncs()
             gc.collect()  # what leaves the graph with its end

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): no node 
 
 import browser
 import rclpy
+from harness import PATIENCE_S
 from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
@@ -59,7 +61,8 @@ class Node:
 
     def until(self, condition: Callable[[], bool], then: Callable[[], object]) -> None:
         """Sends until something is so."""
-        for _ in range(3000):
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
             then()
             if condition():
                 return

@@ -32,8 +32,9 @@ def scene(ros: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]
         "persons": ["ann", "bob"],
         "input_type": "joint_state",
         "person_timeout": 2.0,
-        "max_distance": 50,
-    }  # whole numbers will do for floats
+        "max_distance": 50,  # whole numbers will do for floats
+        "lazy": False,
+    }
     with NodeProcess(log, **parameters) as node:
         peer = Peer("ann", "bob")
         peer.wait_for_node()

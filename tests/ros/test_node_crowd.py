@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import shutil
+import threading
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +25,7 @@ from rmw_dds_common.msg import NodeEntitiesInfo, ParticipantEntitiesInfo
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
+import refu_core
 from msg_adapters import MARKER_ARRAY
 from msg_adapters.markers import encode_lists
 from msg_adapters.scene import Scene
@@ -104,6 +107,27 @@ def test_what_is_loaded_while_nothing_spins_is_taken_over_later(node: Any) -> No
     node.trigger_cleanup()
     node._look_after()
     assert node._fittings is None
+
+
+def test_what_is_asked_for_again_before_it_is_taken_back_is_tried_again(node: Any, tmp_path: Path) -> None:
+    """A request that was repeated between the failure and the next look was forgotten."""
+    shipped, file = Path(refu_core.__file__).parent / "weights" / "tshirt-male", "tailornet-hybrid.safetensors"
+    shutil.copytree(shipped, tmp_path / shipped.name)
+    (tmp_path / shipped.name / file).write_bytes(b"")
+    node.trigger_configure()
+    do, gate = node._loader._pool.submit, threading.Event()
+    again = [Parameter("weights", value=str(tmp_path))]
+    assert node.set_parameters(again)[0].successful
+    do(bool).result()
+    assert "an empty file" in node.statistics.report().last_error
+    shutil.copy(shipped / file, tmp_path / shipped.name)
+    do(gate.wait)
+    assert node.set_parameters(again)[0].successful
+    node._look_after()
+    gate.set()
+    do(bool).result()
+    node._look_after()
+    assert node._in_use.weights == node.settings.weights == str(tmp_path)
 
 
 def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import select
 import signal
-import subprocess
-import sys
-from typing import IO, TYPE_CHECKING
+from collections import defaultdict
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
 from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame
-from rcl_interfaces.srv import GetParameters
+from rcl_interfaces.msg import ParameterEvent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,8 +21,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 
-STALLED = """
-import signal, sys
+LISTENS = """
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 from visualization_msgs.msg import MarkerArray
@@ -57,14 +54,18 @@ def test_a_clock_set_back_is_reported_and_everybody_stays_dressed(scene: Peer) -
 
 
 def test_a_body_that_cannot_be_loaded_is_taken_back(scene: Peer, tmp_path: Path) -> None:
-    def body() -> str:
-        request = GetParameters.Request(names=["body"])
-        return str(scene.call(GetParameters, "garment_node/get_parameters", request).values[0].string_value)
+    values: dict[str, list[str]] = defaultdict(list)
 
+    def heard(event: ParameterEvent) -> None:
+        for one in event.changed_parameters:
+            values[one.name].append(one.value.string_value)
+
+    scene.node.create_subscription(ParameterEvent, "/parameter_events", heard, 10)
+    scene.spin_until(lambda: scene.set(frame_id="map") and values["frame_id"], "what is set is heard of")
     (tmp_path / "body.npz").write_bytes(b"no body")
     assert scene.set(body=str(tmp_path / "body.npz"))[0].successful  # it is loaded beside the stream
-    assert body()
-    scene.spin_until(lambda: not body(), "the parameter says again what is worn")
+    wanted = [str(tmp_path / "body.npz"), ""]
+    scene.spin_until(lambda: values["body"] == wanted, "the parameter says again what is worn")
     for i, garment in enumerate((GARMENTS[1], GARMENTS[0])):
         assert scene.set(garments=[garment])[0].successful
         scene.garments.clear()
@@ -92,31 +93,22 @@ def test_two_publishers_and_leaps_are_reported(scene: Peer) -> None:
     scene.spin_until(lambda: "publishers on" not in said(), "it is gone")
 
 
-def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer) -> None:
+def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer, tmp_path: Path) -> None:
     for turn in range(3):  # without room in shared memory, one turn in eight went wrong
-        stalled = subprocess.Popen([sys.executable, "-c", STALLED], stdout=subprocess.PIPE, text=True)
-        try:
-            assert stalled.stdout is not None
-            got_one: list[str] = []
+        with NodeProcess(tmp_path / f"{turn}.txt", first=LISTENS) as stalled:
 
-            def reads(pipe: IO[str] = stalled.stdout, got_one: list[str] = got_one) -> bool:
+            def reads(log: Path = tmp_path / f"{turn}.txt") -> bool:
                 scene.send(frame(len(scene.garments)))
-                if select.select([pipe], [], [], 0)[0]:
-                    got_one.append(pipe.readline())
-                return bool(got_one)
+                return "got one" in log.read_text()
 
             scene.spin_until(reads, "the second subscriber got one")
-            stalled.send_signal(signal.SIGSTOP)
+            stalled.process.send_signal(signal.SIGSTOP)
             scene.garments.clear()
             for i in range(40):  # eight times what the publisher keeps for who is slow
                 marker = scene.dress(frame(i, stamp_ns=(20_000 + turn) * 10**9 + i))
                 assert np.isfinite(marker.points).all()
             assert scene.status("garments")[0] < 2
-        finally:
-            stalled.kill()
-            stalled.wait()
-            if stalled.stdout is not None:
-                stalled.stdout.close()
+            stalled.stop(signal.SIGKILL)
 
 
 def test_a_second_node_of_the_name_is_reported_by_both(scene: Peer, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import threading
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -188,9 +189,12 @@ def test_so_are_recordings(stage: Callable[..., Stage], tmp_path: Path) -> None:
         scene.until(future.done, "the service answers")
         assert future.result().success, future.result().message
 
-    def recorded() -> bool:
+    def dressed() -> int:
+        return scene.node.statistics.report().total["ticks"]
+
+    def recorded(since: int) -> bool:
         scene.peer.send(frame(1))
-        return int(scene.peer.status("recording")[2].get("messages", 0)) > 3
+        return dressed() > since and int(scene.peer.status("recording")[2].get("messages", 0)) > 3
 
     def is_closed() -> bool:
         return all(one.finished for one in scene.node.recording._closing)
@@ -201,7 +205,7 @@ def test_so_are_recordings(stage: Callable[..., Stage], tmp_path: Path) -> None:
     for bag in ("bag", "bag-1"):
         scene.peer.forget_reports()
         scene.until(lambda: scene.heard() == 1, "the input is recorded")
-        scene.until(recorded, "messages are recorded")
+        scene.until(partial(recorded, dressed()), "messages are recorded")
         switch(False)
         scene.rests()
         scene.until(lambda: scene.reports(1) and is_closed(), "the bag is closed")
@@ -258,12 +262,13 @@ def test_humans_are_found_when_they_are_wanted(stage: Callable[..., Stage]) -> N
 
 def test_overridden_qualities_hold_each_time(stage: Callable[..., Stage]) -> None:
     scene = stage(**{"qos_overrides./smpl_params.subscription.reliability": "reliable"})
+    there = partial(scene.peer.node.get_subscriptions_info_by_topic, "/smpl_params")
     scene.rests()
     for _ in range(2):
         scene.peer.watch()
         scene.dresses()
-        (info,) = scene.peer.node.get_subscriptions_info_by_topic("/smpl_params")
-        assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        scene.until(lambda: len(there()) == 1, "those before are gone")
+        assert there()[0].qos_profile.reliability == ReliabilityPolicy.RELIABLE
         scene.peer.unwatch()
         scene.rests()
 
@@ -277,7 +282,8 @@ def test_the_guide_names_the_qualities_that_can_be_overridden() -> None:
 
 
 def test_the_program_rests_after_some_seconds(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
-    with NodeProcess(tmp_path / "log.txt", **CHEAP) as node:
+    soon = "from refu_ros import _listener; _listener._GRACE_S = 1.0"
+    with NodeProcess(tmp_path / "log.txt", first=soon, **CHEAP) as node:
         peer = Peer()
         peer.wait_for_node()
         peer.dress(frame(1))

@@ -57,20 +57,18 @@ def test_a_bad_parameter_is_named_in_one_line(
 
 
 LOADS_FOREVER = """
-import sys, threading
+import threading
 from refu_core.options import PipelineOptions
-from refu_ros import garment_node
 def load(*_, **__):
     print("loading", flush=True)
     threading.Event().wait()
 PipelineOptions.load = load
-sys.exit(garment_node.main())
 """
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_while_it_loads(ros: None, tmp_path: Path, number: signal.Signals) -> None:  # noqa: ARG001
-    with NodeProcess(tmp_path / "log.txt", program=LOADS_FOREVER) as node:
+    with NodeProcess(tmp_path / "log.txt", first=LOADS_FOREVER) as node:
         end = time.monotonic() + PATIENCE_S
         while "loading" not in node.log and node.process.poll() is None and time.monotonic() < end:
             time.sleep(0.05)

@@ -92,7 +92,13 @@ def test_no_clock_ends_it(scene: tuple[Peer, NodeProcess]) -> None:
     peer, node = scene
     clock = peer.node.create_publisher(Clock, "/clock", 10)
     peer.spin_until(lambda: clock.get_subscription_count(), "the clock is listened to")
-    for seconds, nanoseconds in (
+
+    def strikes(seconds: int, nanoseconds: int) -> None:
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = seconds, nanoseconds
+        clock.publish(message)
+
+    for time in (
         (2**31 - 1, 2**32 - 1),
         (-1, 0),
         (-(2**31), 0),
@@ -100,12 +106,15 @@ def test_no_clock_ends_it(scene: tuple[Peer, NodeProcess]) -> None:
         (5, 2**32 - 1),
         (0, 0),
     ):
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = seconds, nanoseconds
-        clock.publish(message)
+        strikes(*time)
         peer.forget_reports()
-        peer.spin_until(lambda: peer.diagnostics, f"it lives at {seconds} s")
-    peer.spin_until(lambda: count(peer, "/clock") >= 2, "clocks without sense are counted")
+        peer.spin_until(lambda: peer.diagnostics, f"it lives at {time[0]} s")
+
+    def counted() -> bool:  # clocks are best effort, too
+        strikes(-1, 0)
+        return count(peer, "/clock") >= 2
+
+    peer.spin_until(counted, "clocks without sense are counted")
     assert "wanted a stamp that fits a ROS time" in node.log
 
 

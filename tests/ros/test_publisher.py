@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import msg_adapters as adapters
-from refu_core import RefuError, load_body
+from refu_core import RefuError, SmplFrame, load_body
 
 rclpy = pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros)")
 
@@ -124,20 +124,21 @@ def test_plays_a_bag(context: Context, tmp_path: Path, input_type: str, bag: str
 
 def test_persons_stand_apart_and_move_apart(context: Context, tmp_path: Path) -> None:
     listener = Listener(context, "joint_state", ("ann/smpl_params", "bob/smpl_params"))
-    log = tmp_path / "log.txt"
+    log, decode = tmp_path / "log.txt", adapters.decoder_for("joint_state").from_bytes
+
+    def sent() -> list[dict[int, SmplFrame]]:
+        return [{f.stamp_ns: f for f in map(decode, messages)} for messages in listener.received.values()]
+
     process = start(log, input_type="joint_state", persons="[ann, bob]", spacing=1.5, rate=60)
     try:
-        listener.collect(5)
+        listener.until(lambda: len(set.intersection(*map(set, sent()))) >= 5)
     finally:
         process.send_signal(signal.SIGINT)
         status = process.wait(PATIENCE_S)
         listener.close()
     assert status == 0, log.read_text()
-    decode = adapters.decoder_for("joint_state").from_bytes
-    ann, bob = ({f.stamp_ns: f for f in map(decode, messages)} for messages in listener.received.values())
-    common = sorted(ann.keys() & bob.keys())
-    assert common
-    for stamp in common:
+    ann, bob = sent()
+    for stamp in ann.keys() & bob.keys():
         np.testing.assert_allclose(bob[stamp].transl - ann[stamp].transl, [1.5, 0, 0], atol=1e-6)
         assert np.abs(bob[stamp].pose - ann[stamp].pose).max() > 0.01
 
