@@ -135,7 +135,7 @@ def test_a_fork_in_the_middle_of_a_call_is_told_and_not_waited_for() -> None:
     with pipeline._crew.turn():
         child = os.fork()
         if not child:
-            signal.alarm(20)
+            signal.alarm(300)
             try:
                 pipeline(frame)
             except RefuError as error:
@@ -208,7 +208,7 @@ def test_a_batch_after_a_fork_is_dressed_by_one_thread() -> None:
     pipeline(frames)
     child = os.fork()
     if not child:
-        signal.alarm(20)
+        signal.alarm(300)
         os._exit(0 if len(pipeline(_frames(3, seed=1))) == 3 else 1)
     assert os.waitpid(child, 0)[1] == 0
 
