@@ -1,6 +1,5 @@
 """The command `refu`, which is `python -m refu_lab`: an interrupt ends it without a traceback from the start."""
 
-import gc
 import signal
 import sys
 
@@ -11,11 +10,12 @@ def main() -> int:
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from refu_core._collector import keep_what_is_loaded
     from refu_lab.cli import main as run
 
     signal.signal(signal.SIGINT, before)
     code = run()
-    gc.freeze()  # else the interpreter's end goes through all that torch and Warp have made, for a second and more
+    keep_what_is_loaded()  # else the interpreter's end goes through all of it, for a second and more
     return code
 
 

@@ -51,7 +51,9 @@ class Browser:
         found = (re.search(r"DevTools listening on ws://([^/]+)/", line) for line in self._process.stderr)
         self._address = next(match[1] for match in found if match)
         pages: list[dict[str, str]] = []
+        end = time.monotonic() + _LONG_S
         while not pages:  # it listens before it has one
+            assert time.monotonic() < end, "the browser has no page"
             there = json.load(urllib.request.urlopen(f"http://{self._address}/json", timeout=_LONG_S))
             pages = [one for one in there if one["type"] == "page"]
         self._socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=None, open_timeout=_LONG_S)

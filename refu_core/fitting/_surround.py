@@ -141,10 +141,8 @@ def fits_of(points: F64, normals: F64, area: F64, samples: Samples, body: PosedB
     # the body and one that faces away from it, and little that faces anything else.
     pieces, n_pieces = samples.piece[samples.is_open], int(samples.piece.max()) + 1
     at_each = pieces + n_pieces * np.arange(n_places)[:, None]
-    votes, all_votes = (
-        np.bincount(at_each.ravel(), counted, n_places * n_pieces).reshape(n_places, n_pieces)
-        for counted in (is_outer[:, samples.is_open].ravel(), None)
-    )
+    votes = np.bincount(at_each.ravel(), is_outer[:, samples.is_open].ravel(), n_places * n_pieces)
+    votes, all_votes = votes.reshape(n_places, n_pieces), np.bincount(pieces, minlength=n_pieces)
     n_facing = np.maximum(votes, all_votes - votes).sum(1) + (np.abs(outward[:, ~samples.is_open]) > _ACROSS).sum(1)
     figures = zip(
         (distance < -0.01).mean(1).tolist(),
@@ -201,15 +199,13 @@ def lies_over(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
 
 def _crosses(vertices: F64, faces: NDArray[np.int64], starts: F64, ways: F64) -> bool:
     """Whether cloth lies across a line that begins at one of the starts (N, 3) and goes its way (N, 3)."""
-    low, high = vertices[faces[:, 0]], vertices[faces[:, 0]]
-    for k in (1, 2):
-        low, high = np.minimum(low, vertices[faces[:, k]]), np.maximum(high, vertices[faces[:, k]])
-    low, high = low.T.copy(), high.T.copy()
+    first, second, third = (vertices[faces[:, k]] for k in range(3))
+    low, high = (most(most(first, second), third).T.copy() for most in (np.minimum, np.maximum))
     for start, way in zip(starts, ways, strict=True):
         ends = np.sort([start, start + way], axis=0)
         near = np.flatnonzero(np.logical_and.reduce([*(low <= ends[1, :, None]), *(high >= ends[0, :, None])]))
-        corner, u, v = vertices[faces[near]].swapaxes(0, 1)
-        u, v = u - corner, v - corner
+        corner = first[near]
+        u, v = second[near] - corner, third[near] - corner
         normal = np.cross(u, v)
         # Möller and Trumbore 1997: where the way meets each triangle's plane, and if inside it.
         steep = -(normal @ way)
