@@ -6,10 +6,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
+from refu_core._warp import as_warp, memory, recorded, torch_stream
 from refu_core.contact import _way_out_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
-from refu_core.mesh import Connectivity
+from refu_core.contact._sheet import Sheet
 from refu_core.sdf import Winding
 
 
@@ -21,27 +21,22 @@ class WayOut:
     In most frames no vertex is inside, and the winding numbers are the only cost.
     """
 
-    def __init__(self, faces: Tensor, body: Tensor, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
-        """For bodies of closed `faces` (F, 3) and vertices like `body` (V, 3) [m], on their device.
+    def __init__(self, skin: Sheet, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
+        """For poses of this `skin`, on its device.
 
-        Raises `MeshError` when they aren't a closed, consistently oriented surface.
+        Raises `MeshError` when it isn't a closed, consistently oriented surface.
         """
-        self._settings, self.device = settings, body.device
-        self._is_serial = body.device.type == "cpu"
-        self._winding = Winding(faces)
-        self._body = memory(*body.shape, device=body.device).copy_(body)
-        mesh, n_places = Connectivity.of(faces.cpu(), len(body)), len(body) + len(faces)
-        self._points = as_warp(self._body, wp.vec3)
-        self._faces, fan_start, fan = (ints(one, body.device) for one in (mesh.faces, *mesh.fan))
-        self._tree = wp.Mesh(self._points, self._faces.flatten())
-        self._above = memory(n_places, 3, device=body.device)
-        inputs = [settings.tolerance, self._points, self._faces, fan_start, fan, as_warp(self._above, wp.vec3)]
-        self._lift = recorded(kernels.above_kernel, n_places, inputs, body.device)
+        self._skin, self._settings, self.device = skin, settings, skin.vertices.device
+        self._is_serial = self.device.type == "cpu"
+        self._winding = Winding(torch.as_tensor(skin.mesh.faces, device=self.device))
+        n_places = len(skin.vertices) + len(skin.mesh.faces)
+        self._above = memory(n_places, 3, device=self.device)
+        inputs = [settings.tolerance, skin.data.points, skin.data.cut, as_warp(self._above, wp.vec3)]
+        self._lift = recorded(kernels.above_kernel, n_places, inputs, self.device)
 
-    def update(self, body: Tensor) -> None:
-        """Takes over a pose: the body's vertices (V, 3) [m]."""
-        self._body.copy_(body)
-        self._winding.update(body)
+    def update(self) -> None:
+        """Takes over the pose that the skin has taken."""
+        self._winding.update(self._skin.vertices)
 
     @torch.no_grad()
     def __call__(self, points: Tensor, around: Tensor, margin: float) -> tuple[Tensor, Tensor]:
@@ -82,8 +77,8 @@ class WayOut:
 
     def _winding_above(self, wanted: Tensor | None = None) -> Tensor:
         """The winding numbers above the samples of the skin: its vertices, and the middles of its faces."""
+        self._skin.fit()
         with torch_stream(self.device):
-            self._tree.refit()
             self._lift.launch()
         return self._winding(self._above, wanted).clone()
 
@@ -96,7 +91,8 @@ class WayOut:
         """
         foot, normal = points.new_zeros(2, len(points), 3)
         points, asked = points.contiguous(), is_inside.int()
-        inputs = [self._tree.id, self._settings.max_displacement, self._points, self._faces]
+        skin, farthest = self._skin.data, self._settings.max_displacement
+        inputs = [skin.tree, farthest, skin.points, skin.cut.faces]
         inputs += [as_warp(self._above, wp.vec3), as_warp(above, wp.int32), of_samples]
         inputs += [as_warp(points, wp.vec3), as_warp(asked, wp.int32)]
         outputs = [as_warp(foot, wp.vec3), as_warp(normal, wp.vec3)]

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from refu_core.contact._layers_kernels import Cut
 from refu_core.sdf._closest_kernels import area_normal, closest_on_triangle, mean_normal
 
 wp.set_module_options({"enable_backward": False})
@@ -23,9 +24,7 @@ def body_at(sample: int, body: wp.array[wp.vec3], faces: wp.array2d[int]) -> wp.
 def above_kernel(
     lift: float,
     body: wp.array[wp.vec3],
-    faces: wp.array2d[int],
-    fan_start: wp.array[int],
-    fan: wp.array[int],
+    cut: Cut,
     # output
     places: wp.array[wp.vec3],
 ) -> None:
@@ -33,9 +32,9 @@ def above_kernel(
     i = wp.tid()
     f = i - body.shape[0]
     if f < 0:
-        places[i] = body[i] + lift * mean_normal(i, body, faces, fan_start, fan)
+        places[i] = body[i] + lift * mean_normal(i, body, cut.faces, cut.fan_start, cut.fan_face)
     else:
-        places[i] = body_at(i, body, faces) + lift * wp.normalize(area_normal(f, body, faces))
+        places[i] = body_at(i, body, cut.faces) + lift * wp.normalize(area_normal(f, body, cut.faces))
 
 
 @wp.kernel

@@ -25,6 +25,7 @@ from refu_core.contact import (
     WayOut,
 )
 from refu_core.garments import GarmentTemplate, inner_first
+from refu_core.mesh import Connectivity
 from refu_core.modes import SdfMode
 from refu_core.realtime._wearer import Outfit
 from refu_core.refu import VertexScale
@@ -68,14 +69,14 @@ class ContactStage:
         body, garments = outfit.body, {name: one.template for name, one in outfit.wearables.items()}
         self._is_serial = body.device.type == "cpu"
         self.sdf: MeshSdf = exact_sdf(body) if sdf is SdfMode.ACCURATE else ApproxSdf(body)
-        self.way_out = WayOut(body.faces, body.v_template, settings=settings) if certify else None
+        self._skin = Sheet(Connectivity.of(body.faces.cpu(), body.n_vertices), body.v_template)
+        self.way_out = WayOut(self._skin, settings=settings) if certify else None
         self.order = inner_first(garments)
         """Names from the skin outwards."""
         self._has_room = outfit.collider is not None
         """Whether a collider makes room for cloth beside limbs."""
         if outfit.collider is not None:
             self._limbs = LimbMeshes(body)
-            self._skin = Sheet(outfit.collider.anatomy.mesh, body.v_template)
             self._own_side = {name: OwnSide(one.mesh, body.device, settings=settings) for name, one in garments.items()}
             self._press = {
                 name: Press(one.template, self._limbs, knows_arms=one.knows_arms, settings=settings)
@@ -105,10 +106,10 @@ class ContactStage:
         """
         self._body, self._skin_of = body, {}
         self.sdf.update(body)
+        self._skin.take(body)
         if self.way_out is not None:
-            self.way_out.update(body)
+            self.way_out.update()
         if self._has_room:
-            self._skin.take(body)
             self._limbs.update(body)
 
     def unfold(self, name: str, vertices: Tensor, rotation: Tensor) -> Tensor:
@@ -197,8 +198,7 @@ class ContactStage:
         vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
         if was_drawn or was_torn or worn:
             vertices = self._within_reach(vertices, pressed)
-        if self.way_out is not None:
-            vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
+        vertices = self._taken_out(vertices, pressed, margin, numbers)
         if self._has_room:
             distance = done.distance
             if vertices is not done.vertices:  # where they were taken out, the approximate distance had missed a limb
@@ -206,10 +206,14 @@ class ContactStage:
                 distance = torch.where(has_moved, 0.0, distance)
             parted = self._off_skin[name].parted(vertices, distance)
             if parted is not vertices:
-                vertices = self._within_reach(parted, pressed)
-                if self.way_out is not None:
-                    vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
+                vertices = self._taken_out(self._within_reach(parted, pressed), pressed, margin, numbers)
         return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
+
+    def _taken_out(self, vertices: Tensor, pressed: Tensor, margin: float, numbers: Tensor) -> Tensor:
+        """Vertices (V, 3) [m], those inside taken out (`WayOut`); how many have no way is written to `numbers`."""
+        if self.way_out is not None:
+            vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
+        return vertices
 
     def _within_reach(self, vertices: Tensor, pressed: Tensor) -> Tensor:
         """No single step takes vertices (V, 3) [m] farther than this; together they may."""

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core import GarmentPipeline, SmplFrame, load_body
-from refu_core.contact import DEFAULT_CONTACT, WayOut
+from refu_core.contact import DEFAULT_CONTACT, Sheet, WayOut
+from refu_core.mesh import Connectivity
 from refu_core.metrics import CollisionChecker
 from refu_lab.stress._frames import promised
 
@@ -32,8 +33,9 @@ def two_balls(apart: float) -> trimesh.Trimesh:
 
 def made(mesh: trimesh.Trimesh, **changes: float) -> WayOut:
     body = torch.tensor(mesh.vertices, dtype=torch.float32)
-    way_out = WayOut(torch.tensor(mesh.faces), body, settings=replace(DEFAULT_CONTACT, **changes))
-    way_out.update(body)
+    skin = Sheet(Connectivity.of(mesh.faces, len(body)), body)
+    way_out = WayOut(skin, settings=replace(DEFAULT_CONTACT, **changes))
+    way_out.update()
     return way_out
 
 
