@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 from pathlib import Path
 
@@ -55,6 +56,65 @@ def test_links_lead_somewhere(page: Path) -> None:
         path = (page.parent / name).resolve() if name else page
         assert path.exists(), target
         assert not anchor or anchor in headings(path), target
+
+
+MOTION_ROWS = {
+    "collision-free frames, against the collider": "cfmp_percent",
+    "vertices inside the collider": "vfcp_percent",
+    "collision-free frames, against the unmodified skin": "skin_cfmp_percent",
+    "frame pairs, 1/60 s apart, in which a vertex moves more than 20 mm relative": "jump_20_percent",
+    "… by more than 40 mm": "jump_40_percent",
+    "… in which a vertex moves 20 mm farther than it does in the skinned garment": "leap_20_percent",
+    "edges longer than twice their rest length": "stretched_percent",
+}
+"""How the README's rows of recorded motion begin, and what they show."""
+PART_ROWS = {
+    "network alone": "tailornet",
+    "plus the paper's layer": "refu-hybrid-bare",
+    "plus a margin": "refu-hybrid-unblended",
+    "plus blending": "refu-hybrid",
+    "the node: all of these": "node-hybrid",
+}
+
+
+def readme_cells(row: str) -> list[str]:
+    """The cells of the README's one row that begins like this, without the first."""
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    (line,) = (line for line in lines if line.startswith(f"| {row}"))
+    return [cell.strip() for cell in line.strip("|").split("|")[1:]]
+
+
+def results(table: str) -> dict[tuple[str, str, str], float]:
+    """Figures by garment, method and metric."""
+    rows = json.loads((DOCS / "results" / f"{table}.json").read_text(encoding="utf-8"))["rows"]
+    return {(row["garment"], row["method"], row["metric"]): row["value"] for row in rows}
+
+
+def says(cell: str, value: float) -> bool:
+    """Whether a cell shows the value, rounded to its own digits; "100" and "none" say all and none."""
+    if cell == "none":
+        return value == 0
+    number = cell.split()[-2] if cell.endswith(("%", "mm")) else cell
+    if cell.startswith("<"):
+        return 0 < value < float(number)
+    is_rounded = f"{value:.{len(number.partition('.')[2])}f}" == number
+    return is_rounded and (float(number) != 100 or value == 100)
+
+
+def test_the_readme_shows_the_results() -> None:
+    motion, parts, wrong = results("motion"), results("parts"), []
+    garments = "tshirt-male", "shirt-male", "short-pant-male", "skirt-female"
+    for row, metric in MOTION_ROWS.items():
+        cells = readme_cells(row)
+        assert len(cells) == len(garments)
+        for garment, cell in zip(garments, cells, strict=True):
+            value = motion[f"{garment}, all clips", "node-hybrid", metric]
+            wrong += [(row, garment, cell, value)] if not says(cell, value) else []
+    for row, method in PART_ROWS.items():
+        for cell, metric in zip(readme_cells(row), ("mpve_mm", "vfcp_percent", "cfmp_percent"), strict=True):
+            value = parts["all", method, metric]
+            wrong += [(row, metric, cell, value)] if not says(cell, value) else []
+    assert wrong == []
 
 
 def test_named_files_exist() -> None:
