@@ -107,12 +107,19 @@ def _finished_or_new(options: FleetOptions, recording: Input, path: Path) -> dic
         known = records.read_json(f"{name}.json")
         if not isinstance(known, dict) or "key" not in known:
             _require_free(options, name, records)
-        elif known["key"] == key and _is_there(known, options, name):
+        elif known["key"] == key and known.get("hash") == _record_hash(known) and _is_there(known, options, name):
             return known | {"kept": True}
     record = {"key": key, **_make(options, recording, path)}
     if records is not None:
-        records.put_text(json.dumps(record, indent=1, allow_nan=False) + "\n", f"{name}.json")
+        whole = record | {"hash": _record_hash(record)}
+        records.put_text(json.dumps(whole, indent=1, allow_nan=False) + "\n", f"{name}.json")
     return record
+
+
+def _record_hash(record: dict[str, Any]) -> str:
+    """Tells a record that was damaged, and so is worth nothing, whatever it says."""
+    content = {name: value for name, value in record.items() if name != "hash"}
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def _require_free(options: FleetOptions, name: str, records: Folder) -> None:

@@ -72,7 +72,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def _timeless(value: Any) -> Any:
     if isinstance(value, dict):
-        return {k: _timeless(v) for k, v in value.items() if k not in ("latency_ms", "output", "kept")}
+        return {k: _timeless(v) for k, v in value.items() if k not in ("latency_ms", "output", "kept", "hash")}
     return [_timeless(one) for one in value] if isinstance(value, list) else value
 
 
@@ -236,6 +236,31 @@ def test_what_is_finished_is_not_done_again(bags: Path, alone: Path, tmp_path: P
     assert "0 of them before" in capsys.readouterr().out
     assert run(changed, "--output", out, "--frame-id", "world", "--again") == 2
     assert "0 of them before" in capsys.readouterr().out
+
+
+def test_a_record_that_was_damaged_counts_for_nothing(bags: Path, tmp_path: Path, capsys: Any) -> None:
+    """Whatever is wrong in it, its recording is replayed again."""
+    arguments = bags / "a", "--output", tmp_path, "--no-evaluate"
+    assert run(*arguments) == 0
+    record, (whole, other) = (
+        tmp_path / "walk.json",
+        ((tmp_path / f"{name}.json").read_text() for name in ("walk", "turn")),
+    )
+    content = json.loads(whole)
+    for damaged in (
+        content | {"frames": "many"},
+        content | {"latency_ms": None},
+        content | {"worst": {}},
+        {name: value for name, value in content.items() if name != "skipped"},
+        json.loads(other) | {"key": content["key"]},
+    ):
+        record.write_text(json.dumps(damaged))
+        capsys.readouterr()
+        assert run(*arguments) == 0
+        assert "2 of 2 recordings replayed, 1 of them before" in capsys.readouterr().out
+        assert _timeless(json.loads(record.read_text())) == _timeless(content)
+    assert run(*arguments) == 0
+    assert "2 of 2 recordings replayed, 2 of them before" in capsys.readouterr().out
 
 
 def test_a_result_takes_the_place_of_results_alone(bags: Path, tmp_path: Path, capsys: Any) -> None:
