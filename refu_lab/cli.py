@@ -9,11 +9,9 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; more threads would wait for busy cores
 
@@ -33,6 +31,7 @@ from refu_lab.commands._common import (
     require_apart,
     require_distinct,
 )
+from refu_lab.interrupts import handled, interruptible
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
 """Packages of the extra `lab`; any other that may be missing belongs to `train`."""
@@ -47,47 +46,14 @@ def _parser() -> Parser:
     return parser
 
 
-_AGAIN_S = 0.01
-"""After so long an interrupt comes again that was raised in a destructor, where Python only prints it [s]."""
-
-
-def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """A terminated command closes its files like an interrupted one, and no interrupt is lost."""
-    hook = sys.unraisablehook
-
-    def come_again(_signal: int, _frame: FrameType | None) -> None:
-        signal.raise_signal(signal.SIGTERM)  # handled as it is then: it may have to wait for the end of a message
-
-    def unraised(what: Any) -> None:
-        if what.exc_type is KeyboardInterrupt:
-            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-        else:
-            hook(what)
-
-    handlers = {signal.SIGTERM: _interrupt, signal.SIGALRM: come_again}
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    sys.unraisablehook = unraised
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        for number, handler in before.items():
-            signal.signal(number, handler or signal.SIG_DFL)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
     collect_rarely()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal or file that has no → gets a ?
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it can't write to
-    with _interruptible():
+    # A terminated command closes its files like an interrupted one.
+    with handled({signal.SIGTERM: signal.default_int_handler}):
         return _run(arguments)
 
 
@@ -104,7 +70,8 @@ def _run(arguments: Sequence[str] | None) -> int:
         for path in filter(Path.is_file, written.values()):
             for given in _inputs(args, written=path):
                 require_apart(given, path)
-        code: int = args.run(args)
+        with interruptible():
+            code: int = args.run(args)
         print(end="", flush=True)
     except BrokenPipeError:  # who read the output has gone (| head)
         return EXIT_UNREAD

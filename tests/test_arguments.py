@@ -27,6 +27,7 @@ from refu_lab.render import save_png
 from refu_lab.replay import _paced
 from refu_lab.tables import REPLAY_TITLE, html_page
 from tests.core.test_files import SPECIAL
+from tests.lab.test_interrupts import Interrupting
 from tests.virtual_time import VirtualTime
 
 BAG = str(Path(__file__).parents[1] / "bags" / "walk")
@@ -342,16 +343,6 @@ def test_a_bug_is_one_line_and_shows_where_it_is_when_asked(
     monkeypatch.setenv("REFU_DEBUG", "1")
     assert main(["info"]) == cli.EXIT_BUG
     assert "in collect" in capsys.readouterr().err
-
-
-class Interrupting:
-    """What is interrupted while it goes: an array of Warp's, for instance."""
-
-    def __init__(self, number: signal.Signals) -> None:
-        self._number = number
-
-    def __del__(self) -> None:
-        signal.raise_signal(self._number)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
