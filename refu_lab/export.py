@@ -6,7 +6,6 @@ import glob
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import islice
 from os import PathLike
 from pathlib import Path
@@ -19,7 +18,6 @@ from refu_core import GarmentPipeline, PipelineOutput
 from refu_core._files import replacing
 from refu_core.errors import RefuError
 from refu_core.garments import UvMap
-from refu_core.history import PoseHistory
 from refu_core.recordings import turn_from
 from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN
@@ -115,10 +113,7 @@ def export(
         write_meshes((), path)
     if not overwrite:
         require_new(path, count)
-    load = cache(options.load_pipeline)
-    source = open_source(options, lambda: load().body)
-    pipeline = load()
-    source.history = PoseHistory() if pipeline.heeds_past else None
+    source = open_source(options)
     frames, outputs, left_out, n_records = [], [], list[str](), 0
     for number, record in enumerate(islice(source.records, first + count)):
         n_records = number + 1
@@ -128,21 +123,21 @@ def export(
             continue
         try:
             frame = source.frame_of(record)
-            outputs.append(pipeline(frame))
+            outputs.append(source.pipeline(frame))
         except RefuError as error:
             left_out.append(f"frame {number} is left out: {error}")
         else:
             frames.append(frame)
     if n_records < first + count:
         left_out.append(f"it has {n_records} frames, wanted number {first} to {first + count - 1}")
-    warnings = [*source.warnings(pipeline), *left_out]
+    warnings = [*source.warnings(), *left_out]
     if not outputs:
         why = left_out[-1]
         raise RefuError(f"{options.input}: has no frame that can be dressed from number {first} on: {why}")
     step = 1e-9 * float(np.median(np.diff([frame.stamp_ns for frame in frames]))) if len(frames) > 1 else 0.0
     fps = round(1 / step, 3) if step > 0 else 30.0
     turn = turn_from(frames[0].up.astype(np.float64))
-    meshes = meshes_of(pipeline, outputs, with_body=with_body)
+    meshes = meshes_of(source.pipeline, outputs, with_body=with_body)
     if turn[1, 1] != 1:
         meshes = [replace(mesh, vertices=mesh.vertices @ turn.T) for mesh in meshes]
     if not overwrite and len(outputs) < count:  # then the files have other names

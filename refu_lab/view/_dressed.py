@@ -157,14 +157,14 @@ class DressedFilm:
 
     def _frames(self, options: RecordingOptions) -> list[SmplFrame]:
         """At least one frame, in the order of their stamps."""
-        source = open_source(options, lambda: self._pipeline.body)
+        source = open_source(options, self._pipeline)
         source.history = PoseHistory()  # garments that are put on later may heed it
         records, frames = list(source.records), []
         for record in records:
             with suppress(RefuError):
                 frames.append(source.frame_of(record))
         n_bad = len(records) - len(frames)
-        self.notes += source.warnings(self._pipeline)
+        self.notes += source.warnings()
         if n_bad:
             self.notes.append(f"{options.input}: {n_bad} messages are no frame and are left out")
         if not frames:
