@@ -45,7 +45,6 @@ Points = NDArray[np.float64]
 
 
 def bag_of(garment: str) -> Path:
-    """The evaluation bag of a garment."""
     return BAGS / f"eval_{garment.replace('-', '_')}"
 
 

@@ -64,7 +64,6 @@ class CdrReader:
 
     @property
     def remaining(self) -> int:
-        """Bytes not read yet."""
         return len(self._data) - self._at
 
     def align(self, size: int) -> None:
@@ -127,7 +126,6 @@ class CdrReader:
             raise DecodeError(f"wanted a string in UTF-8, got {bytes(raw[:32])!r}: {error.reason}") from None
 
     def strings(self) -> list[str]:
-        """A sequence of strings."""
         return [self.string() for _ in self.items(item_bytes=4)]
 
     def array(self, kind: str, count: int) -> NDArray[Any]:
@@ -156,7 +154,6 @@ class CdrWriter:
         self._payload = bytearray()
 
     def __len__(self) -> int:
-        """Bytes of payload so far."""
         return len(self._payload)
 
     def align(self, size: int) -> None:
@@ -193,7 +190,6 @@ class CdrWriter:
         return at
 
     def strings(self, texts: Sequence[str]) -> None:
-        """Append a sequence of strings."""
         self.fields("I" + "s" * len(texts), len(texts), *texts)
 
     def array(self, kind: str, values: Any) -> int:

@@ -65,7 +65,6 @@ class Statistics:
         self._error = ""
 
     def count(self, key: str) -> None:
-        """Counts one more for a key."""
         with self._lock:
             self._total[key] += 1
 

@@ -106,7 +106,6 @@ class Placement:
         return Placement(self.rotation @ inner.rotation, translation, self.is_late or inner.is_late)
 
     def inverse(self) -> Placement:
-        """The inverse placement."""
         return Placement(self.rotation.T, -(self.rotation.T @ self.translation), self.is_late)
 
 
@@ -166,7 +165,6 @@ class TransformBuffer:
         """Frames that were heard of since others were last forgotten."""
 
     def __len__(self) -> int:
-        """How many frames have a parent."""
         return len(self._tracks)
 
     @property

@@ -162,7 +162,6 @@ def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
 
 
 def warnings_of(worn: dict[str, dict[str, Any]]) -> list[str]:
-    """Warnings about a garment that was tried on."""
     found = []
     if (most := max(left["pairs"] for left in worn.values())) > _MOST_CUT:
         found.append(f"{most} of its triangles cut the body: look at it (--picture) before you use it")
@@ -200,7 +199,6 @@ def list_garments() -> list[dict[str, Any]]:
 
 
 def garments_table(rows: list[dict[str, Any]]) -> str:
-    """What `refu garment list` prints."""
     cells = []
     for row in rows:
         if "fault" in row:
@@ -214,7 +212,6 @@ def garments_table(rows: list[dict[str, Any]]) -> str:
 
 
 def added_text(result: dict[str, Any]) -> str:
-    """What `refu garment add` prints."""
     lines = [f"{result['garment']}: {result['vertices']} vertices, for the body {result['body']}"]
     lines += [f"  - {note}" for note in result["notes"]]
     for pose, left in result["worn"].items():

@@ -117,7 +117,6 @@ class ReplayResult:
             self.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, garments))
 
     def skip(self, reason: str) -> None:
-        """Counts a message that was not replayed."""
         known = reason in self.skips or len(self.skips) < _MAX_REASONS
         self.skips[reason if known else "other reasons"] += 1
 
@@ -133,7 +132,6 @@ class ReplayResult:
         return {"mean": mean, "largest": 1e3 * self.shift_largest}
 
     def as_dict(self) -> dict[str, Any]:
-        """The machine-readable result (`--json`)."""
         garments: dict[str, Any] = {}
         for name, after in self.after.items():
             garments[name] = {
@@ -173,7 +171,6 @@ class Evaluator:
         )
 
     def add(self, frame: SmplFrame, output: PipelineOutput, latency_ms: float) -> dict[str, GarmentRecord]:
-        """Measures one frame."""
         self._checker.update(output.body)
         self._skin.update(output.skin)
         own_ms = {name: output.stats.garments[name].ms for name in output}
@@ -192,7 +189,6 @@ class Evaluator:
         return records
 
     def summarise(self, result: ReplayResult) -> None:
-        """Writes the figures over all frames into a result."""
         result.before, result.after, result.on_skin = (
             {name: metrics.summary() for name, metrics in of.items()}
             for of in (self._before, self._after, self._on_skin)

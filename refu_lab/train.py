@@ -138,7 +138,6 @@ def _seeded(settings: Any, options: TrainOptions, **changes: Any) -> Any:
 
 
 def training_table(card: dict[str, Any], options: TrainOptions) -> str:
-    """What `refu train` prints."""
     named = [name for name in ("backbone", "mode", "preset", "like") if name in card]
     rows: list[tuple[str, str]] = [(name, str(card[name])) for name in named]
     # Mirrored ones count, too, where they were learnt from.

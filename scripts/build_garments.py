@@ -96,7 +96,6 @@ def shorts_ease(p: Vertices) -> NDArray[np.float64]:
 
 
 def skirt_ease(p: Vertices) -> NDArray[np.float64]:
-    """Close at the waist."""
     return 0.0075 + 0.0065 * ramp(p[:, 1], -0.12, -0.28)
 
 

@@ -62,8 +62,6 @@ ACCEPTED: dict[str, str] = {}
 
 @dataclass(frozen=True)
 class Dependency:
-    """One installed distribution."""
-
     name: str
     version: str
     licence: str

@@ -99,7 +99,6 @@ class McapWriter:
         return number
 
     def add_message(self, channel: int, data: bytes, *, log_time_ns: int, sequence: int) -> None:
-        """Appends a message to the chunk under way."""
         n_earlier = sum(self._counts.values())
         self._first_ns = min(self._first_ns, log_time_ns) if n_earlier else log_time_ns
         self._last_ns = max(self._last_ns, log_time_ns)

@@ -39,7 +39,6 @@ class QosProfile:
     depth: int = 10
 
     def to_metadata(self) -> dict[str, Any]:
-        """The profile as rosbag2 writes it."""
         return {
             "history": "keep_last",
             "depth": self.depth,
@@ -76,8 +75,6 @@ class TopicInfo:
 
 @dataclass
 class TopicSummary:
-    """A topic's entry in the metadata."""
-
     name: str
     message_type: str
     type_hash: str

@@ -39,7 +39,6 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse's own takes -1,0 for an option
 
     def error(self, message: str) -> NoReturn:
-        """Prints the error and ends the program."""
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
 
 
@@ -103,7 +102,6 @@ port = partial(_number, int, low=1, high=65_535)
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
-    """A parser of a number from `low` to `high`."""
     return partial(_number, float, low=low, high=high)
 
 

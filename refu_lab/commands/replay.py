@@ -50,8 +50,6 @@ class RecordingOptions(DressOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions(RecordingOptions):
-    """What to replay and how."""
-
     output: Path | None = None
     speed: Literal["max", "real"] = setting("max", "as fast as possible, or paced (real)", choices=("max", "real"))
     frame_id: str = setting(

@@ -119,8 +119,6 @@ def _ctrl_c_waits() -> Iterator[None]:
 
 
 class DaskEngine:
-    """Runs tasks on a client's workers."""
-
     def __init__(self, client: Client) -> None:
         self.client = client
         """The client whose workers run the tasks."""

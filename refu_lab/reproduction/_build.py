@@ -25,8 +25,6 @@ _MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
 
 @dataclass(frozen=True)
 class SampleTable:
-    """A table over test samples."""
-
     title: str
     about: str
     methods: tuple[str, ...]
@@ -39,7 +37,6 @@ class SampleTable:
     """Whether there are rows over all garments together."""
 
     def of(self, run: MethodRun | None) -> Values:
-        """The figures of one method's run on one garment's samples."""
         if run is None:
             return dict.fromkeys(self.metrics)
         return self.values(run) if self.values else {metric: getattr(run.figures, metric) for metric in self.metrics}

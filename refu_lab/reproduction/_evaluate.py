@@ -126,7 +126,6 @@ def results_text(tables: Sequence[ResultTable], output: Path) -> str:
 
 
 def results_dict(tables: Sequence[ResultTable]) -> dict[str, Any]:
-    """The machine-readable result (`--json`)."""
     return {
         "rows": [row._asdict() for table in tables for row in table.rows],
         "missing": [{"table": table.name, **asdict(missing)} for table in tables for missing in table.missing],

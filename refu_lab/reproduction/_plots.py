@@ -91,7 +91,6 @@ PLOTS = {"energy": plot_energy, "alpha": plot_scale, "unseen": plot_unseen}
 
 
 def _shown(study: Study, methods: tuple[str, ...]) -> dict[str, MethodRun]:
-    """The runs of those of the methods that were run on all garments, by label."""
     return {METHODS[name].label: run for name in methods if (run := study.pooled(name)).samples}
 
 

@@ -159,7 +159,6 @@ class MethodRun:
 
     @cached_property
     def figures(self) -> Figures:
-        """The figures over all samples."""
         return Figures.over([sample.figures for sample in self.samples])
 
     @cached_property
@@ -178,7 +177,6 @@ class MethodRun:
         return float(np.median([sum(sample.ms[component] for component in components) for sample in self.samples]))
 
     def of_postures(self, postures: Sequence[str]) -> list[FrameMetrics]:
-        """The figures of the samples in these postures."""
         return [sample.figures for sample in self.samples if sample.posture in postures]
 
 

@@ -103,7 +103,6 @@ def _self_penetrating(rng: np.random.Generator) -> SmplFrame:
 
 
 def _anything(rng: np.random.Generator) -> SmplFrame:
-    """Any rotation of any joint."""
     return frame_of(Rotation.random(N_JOINTS, random_state=rng).as_rotvec(), betas=rng.normal(0, 2, N_BETAS))
 
 

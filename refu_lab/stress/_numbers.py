@@ -52,7 +52,6 @@ def against_float64(subject: Subject, trial: Trial, *, on_collider: bool = False
 
 
 def n_not_finite(*arrays: NDArray[np.floating]) -> int:
-    """How many numbers in the arrays are NaN or infinite."""
     return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
 
 

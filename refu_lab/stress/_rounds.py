@@ -162,8 +162,6 @@ _SOAK_SHARE = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class StressResult:
-    """The results of all checks and soaks."""
-
     tallies: list[Tally] = field(default_factory=list)
     soaks: list[SoakResult] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -177,7 +175,6 @@ class StressResult:
         return sum(one.failures for one in self.tallies) + sum(one.failures for one in self.soaks)
 
     def as_dict(self) -> dict[str, Any]:
-        """The results, ready for JSON."""
         rows = [one.as_dict() for one in self.tallies] + [one.as_dict() for one in self.soaks]
         return {"rows": rows, "left_out": self.left_out, "failures": self.failures}
 

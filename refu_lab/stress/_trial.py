@@ -33,7 +33,6 @@ class Wardrobe:
 
     @property
     def mode(self) -> str:
-        """`<backbone>/<sdf>`."""
         return f"{self.backbone}/{self.sdf}"
 
 
@@ -193,7 +192,6 @@ class Measurement:
 
     @property
     def is_failure(self) -> bool:
-        """Whether anything is wrong."""
         return self.badness > 1
 
 
@@ -219,7 +217,6 @@ class Check:
         return self.name.partition(":")[0]
 
     def holds_for(self, wardrobe: Wardrobe) -> bool:
-        """Whether the wardrobe's mode promises it."""
         return not self.needs_sdf or wardrobe.sdf != "none"
 
     def run(self, subject: Subject, trial: Trial) -> Measurement:
@@ -262,7 +259,6 @@ class Tally:
     """The worst trial, and what was worn in it."""
 
     def add(self, wardrobe: Wardrobe, trial: Trial, measured: Measurement) -> None:
-        """Counts a trial."""
         self.runs += measured.runs
         self.refused += measured.refused
         self.failures += measured.is_failure

@@ -29,8 +29,6 @@ _AWAY_S = 0.25
 
 @dataclass(frozen=True, eq=False)
 class PersonMotion:
-    """One person's motion."""
-
     person: str
     frames: list[SmplFrame]
     times: NDArray[np.float64]
@@ -82,12 +80,10 @@ class DressedFilm:
 
     @property
     def garments(self) -> tuple[str, ...]:
-        """Names of the garments worn."""
         return tuple(self._pipeline.garments)
 
     @property
     def sdf(self) -> str:
-        """The signed distance that finds collisions."""
         return str(self._options.sdf)
 
     @property

@@ -33,7 +33,6 @@ class SceneMesh:
 
     @property
     def is_garment(self) -> bool:
-        """Whether it is a garment."""
         return self.name not in (BODY, SKIN)
 
 

@@ -75,7 +75,6 @@ class LiveFilm:
             ]
 
     def close(self) -> None:
-        """Stops listening."""
         self._topics.close()
 
     def _take(self, topic: str, data: bytes) -> None:

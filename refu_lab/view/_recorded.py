@@ -49,7 +49,6 @@ class Topology:
 
 
 def is_mesh(marker: Marker) -> bool:
-    """Whether a marker shows triangles."""
     return marker.type == TRIANGLE_LIST and marker.action == ADD and len(marker.points) > 0
 
 
@@ -187,7 +186,6 @@ class RecordedFilm:
         return self._times
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
-        """What was recorded at a moment."""
         stored = self._frames[index]
         return [replace(shape, vertices=np.array(self._numbers[place]).reshape(-1, 3)) for shape, place in stored]
 
