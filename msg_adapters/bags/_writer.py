@@ -61,8 +61,6 @@ class BagWriter:
         self._entered: list[Path] = []
         """Directories with entries that a power cut could still lose."""
         self._topics: dict[str, TopicSummary] = {}
-        self._channels: dict[str, int] = {}
-        self._start_ns, self._end_ns = MAX_TIME_NS, 0
         self._finished = False
         try:
             with self._writing():
@@ -116,8 +114,8 @@ class BagWriter:
         metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": type_hash or ""}
         metadata |= {BETAS_OF: betas_of} if betas_of else {}
         with self._writing():
-            self._channels[topic] = self._writer.add_channel(topic, message_type, definition, metadata)
-        self._topics[topic] = TopicSummary(topic, message_type, type_hash or "", qos)
+            channel = self._writer.add_channel(topic, message_type, definition, metadata)
+        self._topics[topic] = TopicSummary(topic, message_type, type_hash or "", qos, channel)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int) -> None:
         """Append a message in CDR, sent and received at `log_time_ns`.
@@ -129,11 +127,7 @@ class BagWriter:
         if not 0 <= log_time_ns <= MAX_TIME_NS:
             raise BagError(f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}")
         with self._writing():
-            sequence = self._topics[topic].message_count & 0xFFFFFFFF
-            self._writer.add_message(self._channels[topic], data, log_time_ns=log_time_ns, sequence=sequence)
-        self._topics[topic].message_count += 1
-        self._start_ns = min(self._start_ns, log_time_ns)
-        self._end_ns = max(self._end_ns, log_time_ns)
+            self._writer.add_message(self._topics[topic].channel, data, log_time_ns=log_time_ns)
 
     def sync(self) -> None:
         """Bring everything that was written so far to the disk, where it survives a power cut and can be read.
@@ -153,9 +147,9 @@ class BagWriter:
         """
         if self._finished:
             return
-        start_ns, topics = min(self._start_ns, self._end_ns), [*self._topics.values()]
-        name, end_ns = self.file_path.name, self._end_ns
-        text, record = dump_metadata(file_name=name, topics=topics, start_ns=start_ns, end_ns=end_ns)
+        name, topics, written = self.file_path.name, [*self._topics.values()], self._writer
+        times = {"start_ns": written.first_ns, "end_ns": written.last_ns}
+        text, record = dump_metadata(file_name=name, topics=topics, counts=written.counts, **times)
         with self._writing():
             self._writer.add_metadata("rosbag2", {"serialized_metadata": record})
             self._writer.finish()
