@@ -24,7 +24,6 @@ from refu_lab.render import SKIN
 from refu_lab.sources import open_source
 
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
-"""Suffixes of the files that can be written."""
 _USD = (".usda", ".usdc", ".usd")
 _FAR = 100.0
 """Farther than this from the origin, float32 has steps of 8 µm and more [m]."""

@@ -87,7 +87,6 @@ class ReplayResult:
     source: str
     """What was read: a topic and its type, or a motion file."""
     pipeline: GarmentPipeline
-    """What dressed the frames."""
     frames: list[FrameResult] = field(default_factory=list)
     """The frames that were evaluated."""
     latencies_ms: array[float] = field(default_factory=lambda: array("d"))

@@ -55,16 +55,13 @@ class Source:
     is_fitted: bool = False
     """Whether its betas were fitted to the body that wears the garments."""
     frame_id: str = WORLD_FRAME
-    """The frame_id of the output."""
 
     track: adapters.Track = field(default_factory=adapters.Track)
     """Finds what is doubtful in a bag's units, stamps and axes; motion files are checked when they are read."""
     history: PoseHistory | None = field(init=False)
     """Adds its past to each frame; None where no garment heeds it (`GarmentPipeline.heeds_past`)."""
     has_betas: bool = False
-    """Whether any frame so far had a shape."""
     has_style: bool = False
-    """Whether any frame so far had a style."""
 
     def __post_init__(self) -> None:
         self.history = PoseHistory() if self.pipeline.heeds_past else None

@@ -30,7 +30,6 @@ from refu_lab.sources import open_source
 
 FIGURES = ("mpve_mm", "vfcp_percent", "cfmp_percent", "max_depth_mm")
 Key = tuple[str, str]
-"""Backbone and mode."""
 
 
 def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> BenchmarkResult:

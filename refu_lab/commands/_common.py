@@ -94,11 +94,8 @@ def _number(kind: type[Number], text: str, *, low: float, high: float) -> Number
 
 
 positive = partial(_number, int, low=1, high=_MOST)
-"""A whole number above zero."""
 seed = partial(_number, int, low=0, high=_MOST)
-"""A whole number that can be a random seed."""
 port = partial(_number, int, low=1, high=65_535)
-"""A port number."""
 
 
 def between(low: float, high: float) -> Callable[[str], float]:

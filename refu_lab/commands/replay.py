@@ -59,7 +59,6 @@ class ReplayOptions(RecordingOptions):
     overwrite: bool = setting(False, "replace an existing output")
     evaluate: bool = setting(True, "check every frame for collisions; if not, only its latency is kept")
     with_body: bool = True
-    """Whether the output also has the body."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -121,7 +121,6 @@ def _ctrl_c_waits() -> Iterator[None]:
 class DaskEngine:
     def __init__(self, client: Client) -> None:
         self.client = client
-        """The client whose workers run the tasks."""
 
     def run(
         self, make: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task]

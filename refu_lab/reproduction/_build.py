@@ -28,7 +28,6 @@ class SampleTable:
     title: str
     about: str
     methods: tuple[str, ...]
-    """Methods in the order of the rows."""
     metrics: tuple[str, ...] = _MAIN
     """Metrics that a method without a run has, too, as None."""
     values: Callable[[MethodRun], Values] | None = None
@@ -184,7 +183,6 @@ def unseen_groups(run: MethodRun) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 POSTURE_METHODS = ("tailornet", "node-hybrid")
-"""Methods that the table of postures needs."""
 _SDFS = ("approx", "accurate")
 _MODES = (*_SDFS, "hybrid")
 _OPTIMISATIONS = (
@@ -307,4 +305,3 @@ _COMPONENTS: Mapping[str, tuple[str, ...]] = {
 }
 """For each component its label, the method that has it, and the parts of that method's time."""
 TIMED_METHODS = tuple(dict.fromkeys(method for _, method, *_ in _COMPONENTS.values()))
-"""Methods that the table of times needs."""

@@ -31,7 +31,6 @@ from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._tables import Missing, ResultTable
 
 OUTFITS = (DEFAULT_GARMENTS, ("shirt-male",), ("skirt-female",))
-"""Garments that are worn together."""
 MOTION_METHODS = ("node-hybrid", "node-accurate")
 """Methods that are shown for every clip, in the order of the rows."""
 NEAR = 0.02

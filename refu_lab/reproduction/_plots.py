@@ -87,7 +87,6 @@ def plot_unseen(study: Study, folder: Path) -> list[tuple[str, str]]:
 
 
 PLOTS = {"energy": plot_energy, "alpha": plot_scale, "unseen": plot_unseen}
-"""The functions that draw the plots of each table."""
 
 
 def _shown(study: Study, methods: tuple[str, ...]) -> dict[str, MethodRun]:

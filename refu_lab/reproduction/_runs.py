@@ -196,7 +196,6 @@ class Study:
     """By (garment, method)."""
     missing: dict[tuple[str, str], Missing] = field(default_factory=dict)
     n_samples: dict[str, int] = field(default_factory=dict)
-    """Test samples by garment."""
 
     def pooled(self, method: str) -> MethodRun:
         """The method on all garments; without samples if one is missing, as means would then be over other garments."""

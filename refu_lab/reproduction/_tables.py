@@ -130,7 +130,6 @@ class Missing:
     method: str
     reason: str
     command: str
-    """The command that makes what is missing."""
 
 
 @dataclass(eq=False)

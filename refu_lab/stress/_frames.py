@@ -156,7 +156,6 @@ FRAMES: Mapping[str, Draw] = {
     "limbs through the trunk": _self_penetrating,
     "absurd": _absurd,
 }
-"""Kinds of frames, by name."""
 
 
 def between(poses: Sequence[NDArray[np.floating]], steps: int) -> list[NDArray[np.float64]]:

@@ -125,7 +125,6 @@ POINTS: dict[str, Place] = {
     "far away": _far,
     "faces without area": _without_area,
 }
-"""Kinds of query points, by name."""
 
 
 def distances(place: Place) -> Callable[[Subject, Trial], Iterator[Measurement]]:

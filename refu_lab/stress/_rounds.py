@@ -46,7 +46,6 @@ DrawTrial = Callable[[np.random.Generator], Trial]
 _FRAMES = 64
 """Frames in a trial of numbers, and persons in a batch."""
 _STEPS = 24
-"""Frames of a motion."""
 
 
 def _many(draw: Draw) -> DrawTrial:
@@ -157,7 +156,6 @@ CHECKS: dict[str, Check] = {
 
 
 _SOAK_SHARE = 0.3
-"""Share of a long run's time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +165,6 @@ class StressResult:
     left_out: list[str] = field(default_factory=list)
     """What could not be tried, and why."""
     files: list[Path] = field(default_factory=list)
-    """Files of the worst cases."""
 
     @property
     def failures(self) -> int:

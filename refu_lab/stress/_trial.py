@@ -169,7 +169,6 @@ class Measurement:
     """What one trial, or a part of it, showed."""
 
     runs: int = 1
-    """Frames tried."""
     refused: int = 0
     """How many of them were refused with an error that says why."""
     nan: int = 0
@@ -179,7 +178,6 @@ class Measurement:
     limit: float = math.inf
     """The largest acceptable deviation [m], above zero."""
     faults: tuple[str, ...] = ()
-    """What else went wrong."""
     culprit: int | None = None
     """Index of the frame that showed this, if that frame alone reproduces it."""
 
@@ -254,7 +252,6 @@ class Tally:
     faults: list[str] = field(default_factory=list)
     """The first few."""
     worst: Measurement | None = None
-    """What the worst trial showed."""
     worst_trial: tuple[Wardrobe, Trial] | None = None
     """The worst trial, and what was worn in it."""
 

@@ -55,7 +55,6 @@ class DressedFilm:
         self._given = dict(zip(self.garments, options.garments, strict=True))
         """What each garment was asked for by: some are files."""
         self.notes: list[str] = []
-        """Warnings for the user."""
         names = _different([path.stem for path in inputs]) if len(inputs) > 1 else [""]
         self._tracks = [track for path, name in zip(inputs, names, strict=True) for track in self._read(path, name)]
         longest = max(self._tracks, key=lambda track: len(track.frames))

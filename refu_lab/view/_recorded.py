@@ -141,7 +141,6 @@ class RecordedFilm:
     def __init__(self, path: Path, *, progress: bool = False) -> None:
         self.title = path.name
         self.notes: list[str] = []
-        """Warnings for the user."""
         self._spool = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the film)
         self._size = 0
         scene: MarkerScene[_Stored] = MarkerScene(self._store)
