@@ -18,29 +18,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; more threa
 from refu_core import RefuError, __version__
 from refu_core._collector import collect_rarely
 from refu_core.errors import printable
-from refu_lab.commands import COMMANDS
-from refu_lab.commands._common import (
-    EXIT_BAD_INPUT,
-    EXIT_BUG,
-    EXIT_CHECK_FAILED,
-    EXIT_INTERRUPTED,
-    EXIT_UNREAD,
-    Parser,
-    add_subcommands,
-    check_writable,
-    require_apart,
-    require_distinct,
-)
+from refu_lab.commands import COMMANDS, _common
 from refu_lab.interrupts import handled, interruptible
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
 """Packages of the extra `lab`; any other that may be missing belongs to `train`."""
 
 
-def _parser() -> Parser:
-    parser = Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
+def _parser() -> _common.Parser:
+    parser = _common.Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
     parser.add_argument("--version", action="version", version=f"refu {__version__}")
-    commands = add_subcommands(parser, metavar="COMMAND")
+    commands = _common.add_subcommands(parser, metavar="COMMAND")
     for command in COMMANDS:
         command.add(commands)
     return parser
@@ -64,33 +52,33 @@ def _run(arguments: Sequence[str] | None) -> int:
             print(end="", flush=True)
         written = _outputs(args)
         for path in written.values():
-            check_writable(path)
-        require_distinct(written)
+            _common.check_writable(path)
+        _common.require_distinct(written)
         for path in filter(Path.is_file, written.values()):
             for given in _inputs(args, written=path):
-                require_apart(given, path)
+                _common.require_apart(given, path)
         with interruptible():
             code: int = args.run(args)
         print(end="", flush=True)
     except BrokenPipeError:  # who read the output has gone (| head)
-        return EXIT_UNREAD
+        return _common.EXIT_UNREAD
     except RefuError as error:
-        return _failed(f"error: {error}", EXIT_BAD_INPUT)
+        return _failed(f"error: {error}", _common.EXIT_BAD_INPUT)
     except (OSError, UnicodeError, MemoryError, RecursionError) as error:
-        return _failed(f"error: {str(error) or type(error).__name__}", EXIT_BAD_INPUT)
+        return _failed(f"error: {str(error) or type(error).__name__}", _common.EXIT_BAD_INPUT)
     except ModuleNotFoundError as error:  # a package of an extra: every command imports those of the core
         extra = "lab" if str(error.name).partition(".")[0] in _OF_LAB else "train"
-        return _failed(f'error: {error.name} is not installed: pip install "refu-ros[{extra}]"', EXIT_BAD_INPUT)
+        return _failed(f'error: {error.name} is not installed: pip install "refu-ros[{extra}]"', _common.EXIT_BAD_INPUT)
     except KeyboardInterrupt:
-        return _failed("interrupted", EXIT_INTERRUPTED)
+        return _failed("interrupted", _common.EXIT_INTERRUPTED)
     except Exception as error:
         from refu_core._device import is_device_loss
 
         if is_device_loss(error):
-            reason = str(error).splitlines()[0]
-            return _failed(f"error: the device has failed: {reason}; run it again, or on the cpu", EXIT_CHECK_FAILED)
+            what = f"error: the device has failed: {str(error).splitlines()[0]}; run it again, or on the cpu"
+            return _failed(what, _common.EXIT_CHECK_FAILED)
         what = f"{type(error).__name__}: {error}"
-        return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", EXIT_BUG)
+        return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", _common.EXIT_BUG)
     finally:
         _drop_unwritable()
     return code
@@ -128,7 +116,7 @@ def _inputs(args: argparse.Namespace, *, written: Path) -> list[Path]:
 
 def _failed(reason: str, code: int) -> int:
     """Prints the reason in one line, with REFU_DEBUG also the traceback; returns the code."""
-    if os.environ.get("REFU_DEBUG") and code != EXIT_INTERRUPTED:
+    if os.environ.get("REFU_DEBUG") and code != _common.EXIT_INTERRUPTED:
         traceback.print_exc()
     print(f"refu: {printable(reason)}", file=sys.stderr)
     return code
