@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -59,12 +58,16 @@ def meshes_of(
 
 def require_new(path: Path, count: int) -> None:
     """Raises `RefuError` if a file that `write_meshes` would make of `count` frames is there already."""
-    suffix, number = path.suffix.lower(), "[0-9]" * len(str(count - 1))
-    is_one = count == 1 or suffix in _USD
-    found = path.parent.glob(glob.escape(path.name) if is_one else f"{glob.escape(path.stem)}_{number}{suffix}")
-    there = next(found, None)
+    there = next((one for one in _files(path, count) if one.exists()), None)
     if there is not None:
         raise RefuError(f"{there} is there already: name another file, or --overwrite it")
+
+
+def _files(path: Path, count: int) -> list[Path]:
+    """The files of `count` frames: one for each, numbered if there are several, and one for all in USD."""
+    suffix, digits = path.suffix.lower(), len(str(count - 1))
+    is_one = count == 1 or suffix in _USD
+    return [path] if is_one else [path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
 
 
 def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps: float = 30.0) -> list[Path]:
@@ -89,8 +92,7 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
         if suffix in _USD:
             _write_usd(meshes, path, fps, origin)
             return [path]
-        digits = len(str(count - 1))
-        paths = [path if count == 1 else path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
+        paths = _files(path, count)
         for k, one in enumerate(paths):
             with replacing(one) as file:
                 file.write(_glb(meshes, k, origin) if suffix == ".glb" else _obj(meshes, k))

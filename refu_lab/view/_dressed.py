@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,10 @@ from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
-from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
+from refu_lab.view._film import BODY, SKIN, SceneMesh
 
+_CACHE_BYTES = 512 << 20
+"""Of frames that are kept, once dressed."""
 _AWAY_S = 0.25
 """A person whose nearest frame is farther off in time isn't shown [s]."""
 
@@ -59,16 +62,12 @@ class DressedFilm:
         self._tracks = [track for path, name in zip(inputs, names, strict=True) for track in self._read(path, name)]
         longest = max(self._tracks, key=lambda track: len(track.frames))
         self._moments = longest.times
+        self.times = self._moments - self._moments[0]
+        """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
         first = self._tracks[0]
         self._origin = first.turn @ first.frames[0].transl
         self._begin()
         self.title = ", ".join(path.name for path in inputs)
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
-        times: NDArray[np.float64] = self._moments - self._moments[0]
-        return times
 
     @property
     def front(self) -> float:
@@ -104,7 +103,8 @@ class DressedFilm:
         self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: drawing compares identities
         n_vertices = 2 * self._pipeline.body.n_vertices
         n_vertices += sum(one.n_vertices for one in self._pipeline.garments.values())
-        self._dressed = remembering(self._dress, frame_bytes=12 * n_vertices * len(self._tracks))
+        frame_bytes = 12 * n_vertices * len(self._tracks)
+        self._dressed = lru_cache(max(1, _CACHE_BYTES // frame_bytes))(self._dress)
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
         """All persons in a frame, dressed. Raises `RefuError`."""

@@ -174,15 +174,11 @@ class RecordedFilm:
             raise RefuError(msg)
         self._frames = [shown for _, shown in moments]
         steps = 1e-9 * np.diff([log_time_ns for log_time_ns, _ in moments])
-        self._times = np.append(0.0, np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE_S)))
+        self.times = np.append(0.0, np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE_S)))
+        """Times of the frames, from the first one on [s], shape (T,)."""
         self._spool.flush()
         self._numbers = np.memmap(self._spool, np.float32, "r")
         self.front = _front(path)
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Times of the frames, from the first one on [s], shape (T,)."""
-        return self._times
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
         stored = self._frames[index]
