@@ -72,8 +72,7 @@ def numbers(count: int, *, least: int = 1) -> Callable[[str], tuple[float, ...]]
             found = ()
         if not least <= len(found) <= count or not all(map(math.isfinite, found)):
             most = f"up to {count}" if least < count else count
-            msg = f"wanted {most} finite numbers with commas between them, got {text!r}"
-            raise argparse.ArgumentTypeError(msg)
+            raise argparse.ArgumentTypeError(f"wanted {most} finite numbers with commas between them, got {text!r}")
         return found + (0.0,) * (count - len(found))
 
     return parse
