@@ -26,6 +26,7 @@ from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import find_recordings, open_engine
 from refu_lab.fleet.replay import FleetOptions, replay_fleet
 from refu_lab.replay import replay
+from refu_lab.sources import open_source
 from refu_lab.stress import resident_mb
 
 ROOT = Path(__file__).parents[1]
@@ -76,7 +77,7 @@ def _convert(folder: Path, frames: list[SmplFrame], rounds: int) -> None:
         for frame in part:
             pipeline(frame)
         between = [clock() for clock in clocks.values()]
-        replay(options, pipeline=pipeline)
+        replay(options, source=open_source(options, pipeline))
         after = [clock() for clock in clocks.values()]
         seconds.append((np.subtract(between, before), np.subtract(after, between)))
     ms = 1e3 / len(part) * np.array(seconds[1:])  # the first round warms up kernels and caches

@@ -59,7 +59,6 @@ class Cluster:
         self.workers[k] = self._worker()
 
     def kill(self) -> None:
-        """Kill the scheduler and its workers."""
         for process in (self.scheduler, *self.workers):
             process.kill()
             process.wait()

@@ -223,7 +223,6 @@ def percentiles(values: list[float]) -> dict[str, float]:
 
 
 def summary(sent: dict[str, list[int]], got: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Shares and latencies of all persons together."""
     n_sent = sum(map(len, sent.values()))
     ms = [(int(stamp), value) for person in got.values() for stamp, value in person.items()]
     n_got = sum(len(set(map(int, got[person])) & set(stamps)) for person, stamps in sent.items())

@@ -21,20 +21,8 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from refu_core import GarmentPipeline, SmplFrame
+from refu_core import GarmentPipeline, SmplFrame, outputs
 from refu_core.observation import Observer
-from refu_core.outputs import (
-    Clearance,
-    LimbContacts,
-    Openings,
-    PinholeCamera,
-    PlannerMesh,
-    Sigma,
-    all_visible,
-    depth_image,
-    load_sigma,
-    visible,
-)
 from refu_lab.truth import TrueFrame, coverage, cross_checked, held_out, moments_of
 
 BAGS = Path(__file__).parents[1] / "bags"
@@ -45,7 +33,6 @@ Points = NDArray[np.float64]
 
 
 def bag_of(garment: str) -> Path:
-    """The evaluation bag of a garment."""
     return BAGS / f"eval_{garment.replace('-', '_')}"
 
 
@@ -53,7 +40,7 @@ def openings() -> None:
     """Centres and normals compared with those of the simulated garment, and how steady they are."""
     for garment in GARMENTS:
         pipeline = GarmentPipeline.load([garment])
-        of = Openings(pipeline.garments[garment])
+        of = outputs.Openings(pipeline.garments[garment])
         off: dict[str, list[tuple[float, float]]] = {name: [] for name in of.names}
         for moment in moments_of(bag_of(garment), pipeline.garments[garment]):
             worn = of.frames(pipeline(moment.frame)[garment].local)
@@ -77,7 +64,7 @@ def steadiness() -> None:
     rng = np.random.default_rng(0)
     for outfit in (["tshirt-male", "short-pant-male"], ["skirt-female"]):
         pipeline = GarmentPipeline.load(outfit)
-        every = {name: Openings(garment) for name, garment in pipeline.garments.items()}
+        every = {name: outputs.Openings(garment) for name, garment in pipeline.garments.items()}
         pose = np.zeros((24, 3))
         pose[16, 2], pose[17, 2] = -1.1, 1.1
         for degrees in (0.0, 0.1, 0.2):
@@ -104,7 +91,7 @@ def planner() -> None:
     for garment in GARMENTS:
         pipeline = GarmentPipeline.load([garment])
         template = pipeline.garments[garment]
-        coarse, faces = PlannerMesh.of(pipeline, garment), template.faces.numpy()
+        coarse, faces = outputs.PlannerMesh.of(pipeline, garment), template.faces.numpy()
         there, back, closed = [], [], True
         for moment in moments_of(bag_of(garment), template)[::4]:
             worn = pipeline(moment.frame)[garment].local.astype(np.float64)
@@ -127,14 +114,14 @@ def sigma() -> None:
     """How often a 90 % interval holds on a style-shape pair when it is fitted to all the others."""
     for garment in GARMENTS:
         samples = held_out(bag_of(garment), garment)
-        found, share = load_sigma(samples.garment), cross_checked(samples)
+        found, share = outputs.load_sigma(samples.garment), cross_checked(samples)
         print(f"sigma      {garment:16} {1e3 * found.sigma.mean():.1f} mm; 90 % holds {100 * share:.1f} % of the rest")
     moving = held_out(BAGS / "eval_tshirt_male_sequence", "tshirt-male")
-    share = coverage(load_sigma(moving.garment), moving)
+    share = coverage(outputs.load_sigma(moving.garment), moving)
     print(f"sigma      tshirt-male in motion: 90 % holds {100 * share:.1f} %")
 
 
-def measured(depth: NDArray[np.float32], camera: PinholeCamera, rng: np.random.Generator) -> Points:
+def measured(depth: NDArray[np.float32], camera: outputs.PinholeCamera, rng: np.random.Generator) -> Points:
     """A depth picture as points in the world's axes, with a sensor's noise."""
     row, column = np.nonzero(np.isfinite(depth))
     z = depth[row, column] + rng.normal(0, SENSOR, len(row))
@@ -164,10 +151,10 @@ def _follow(pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *
         way = 0.4 if keeps else rng.uniform(-np.pi, np.pi)
         middle = moment.truth.mean(0)
         eye = middle + np.array([2 * np.sin(way), 0.5, 2 * np.cos(way)])
-        camera = PinholeCamera.looking_at(middle, eye, width=320, height=240)
+        camera = outputs.PinholeCamera.looking_at(middle, eye, width=320, height=240)
         skin = (out.skin, skin_faces)
-        points = measured(depth_image([(moment.truth, faces), skin], camera), camera, rng)
-        seen = moment.truth[visible(moment.truth, faces, camera, [skin])]
+        points = measured(outputs.depth_image([(moment.truth, faces), skin], camera), camera, rng)
+        seen = moment.truth[outputs.visible(moment.truth, faces, camera, [skin])]
 
         def off(vertices: NDArray[np.float32], seen: Points = seen) -> float:
             square = igl.point_mesh_squared_distance(seen, vertices.astype(np.float64), faces)[0]
@@ -202,11 +189,11 @@ def times() -> None:
     out = pipeline(frame)
     worn, body = out["tshirt-male"].local, (out.body, pipeline.body.faces.numpy())
     meshes = [(out[name].local, out[name].faces) for name in out]
-    camera = PinholeCamera.looking_at([0, 0, 0], [0.3, 0.4, 2.2], width=320, height=240)
-    depth = depth_image([*meshes, body], camera)
+    camera = outputs.PinholeCamera.looking_at([0, 0, 0], [0.3, 0.4, 2.2], width=320, height=240)
+    depth = outputs.depth_image([*meshes, body], camera)
     points = measured(depth, camera, np.random.default_rng(0))
-    rims, solid, every = Openings(shirt), PlannerMesh.of(pipeline, shirt.name), Sigma(pipeline)
-    clear, limbs, observer = Clearance.of(pipeline), LimbContacts.of(pipeline), Observer(pipeline)
+    rims, solid, every = outputs.Openings(shirt), outputs.PlannerMesh.of(pipeline, shirt.name), outputs.Sigma(pipeline)
+    clear, limbs, observer = outputs.Clearance.of(pipeline), outputs.LimbContacts.of(pipeline), Observer(pipeline)
     spread = np.tile(1e-4 * np.eye(3), (24, 1, 1))
     turned = [SmplFrame(pose=pose + 1e-4 * i) for i in range(40)]
     order = iter(turned * 20)
@@ -215,7 +202,7 @@ def times() -> None:
         "planner mesh of a T-shirt": lambda: solid.solid(worn),
         "clearance, both garments": lambda: clear(out),
         "limb contacts, both garments": lambda: limbs(out),
-        "visible, both garments and body": lambda: all_visible([*meshes, body], camera),
+        "visible, both garments and body": lambda: outputs.all_visible([*meshes, body], camera),
         "sigma": lambda: every(frame, out),
         "sigma with the pose's covariance": lambda: every(frame, out, pose_covariance=spread),
         "a frame of the pipeline": lambda: pipeline(next(order)),

@@ -132,7 +132,6 @@ class ColliderBench:
 
 
 def write_collider(clips: list[Motion], every: int, folder: Path) -> None:
-    """Writes collider.json and collider.md."""
     bench = ColliderBench(clips, every)
     cost, shipped = bench.cost(), ColliderSettings()
     rows = {f"{name} {value}".strip(): bench.measure(one) for name, value, one in tqdm(list(changes(shipped)))}
@@ -169,7 +168,6 @@ faces, a frame."""
 
 
 def write_contact(clips: list[Motion], every: int, folder: Path) -> None:
-    """Writes contact.md."""
     pairs = [frame_pair(clip, index) for clip in clips for index in range(0, len(clip) - 1, every)]
     rows: dict[str, list[list[str]]] = {garment: [] for garment in GARMENTS}
     for name, value, settings in tqdm(list(changes(DEFAULT_CONTACT))):

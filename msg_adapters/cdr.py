@@ -40,16 +40,12 @@ class CdrReader:
         if self._data[0] != 0 or self._data[1] not in _BYTE_ORDERS:
             raise DecodeError(f"wanted a plain CDR header (00 00 or 00 01), got {self._data[:2].hex(' ')}")
         self._order = _BYTE_ORDERS[self._data[1]]
-        self._at = HEADER_BYTES
-
-    @property
-    def place(self) -> int:
+        self.place = HEADER_BYTES
         """Where the next field begins, in bytes from the start."""
-        return self._at
 
     def since(self, place: int) -> tuple[str, bytes]:
         """The bytes read since `place`, with their byte order: equal bytes hold equal fields, see `repeats`."""
-        return self._order, bytes(self._data[place : self._at])
+        return self._order, bytes(self._data[place : self.place])
 
     def repeats(self, known: tuple[str, bytes]) -> bool:
         """Whether the bytes that `since` gave for another message come next; if so they are skipped.
@@ -57,28 +53,27 @@ class CdrReader:
         Both must begin where the strictest alignment of their fields is satisfied.
         """
         order, raw = known
-        if order != self._order or bytes(self._data[self._at : self._at + len(raw)]) != raw:
+        if order != self._order or bytes(self._data[self.place : self.place + len(raw)]) != raw:
             return False
-        self._at += len(raw)
+        self.place += len(raw)
         return True
 
     @property
     def remaining(self) -> int:
-        """Bytes not read yet."""
-        return len(self._data) - self._at
+        return len(self._data) - self.place
 
     def align(self, size: int) -> None:
         """Skip padding up to a multiple of `size` bytes of payload."""
-        self._at += (HEADER_BYTES - self._at) % size
+        self.place += (HEADER_BYTES - self.place) % size
 
     def skip(self, n_bytes: int) -> memoryview:
         """The next `n_bytes`, as a view."""
-        end = self._at + n_bytes
-        if not self._at <= end <= len(self._data):
-            msg = f"wanted {n_bytes} more bytes at byte {self._at}, the message has {max(self.remaining, 0)}"
+        end = self.place + n_bytes
+        if not self.place <= end <= len(self._data):
+            msg = f"wanted {n_bytes} more bytes at byte {self.place}, the message has {max(self.remaining, 0)}"
             raise DecodeError(msg)
-        view = self._data[self._at : end]
-        self._at = end
+        view = self._data[self.place : end]
+        self.place = end
         return view
 
     def fields(self, codes: str) -> tuple[Any, ...]:
@@ -127,7 +122,6 @@ class CdrReader:
             raise DecodeError(f"wanted a string in UTF-8, got {bytes(raw[:32])!r}: {error.reason}") from None
 
     def strings(self) -> list[str]:
-        """A sequence of strings."""
         return [self.string() for _ in self.items(item_bytes=4)]
 
     def array(self, kind: str, count: int) -> NDArray[Any]:
@@ -156,7 +150,6 @@ class CdrWriter:
         self._payload = bytearray()
 
     def __len__(self) -> int:
-        """Bytes of payload so far."""
         return len(self._payload)
 
     def align(self, size: int) -> None:
@@ -193,7 +186,6 @@ class CdrWriter:
         return at
 
     def strings(self, texts: Sequence[str]) -> None:
-        """Append a sequence of strings."""
         self.fields("I" + "s" * len(texts), len(texts), *texts)
 
     def array(self, kind: str, values: Any) -> int:

@@ -89,7 +89,6 @@ MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 
 LINE_STRIP, POINTS, TRIANGLE_LIST = 4, 8, 11
 ADD, DELETE, DELETE_ALL = 0, 2, 3
-"""What a marker's `action` may be."""
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
 _NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)

@@ -33,7 +33,6 @@ class Motion(Recording):
         return f"Motion({self.source}: {len(self)} frames at {self.fps:g} Hz, {self.gender})"
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.poses)
 
     def frame(self, index: int) -> SmplFrame:

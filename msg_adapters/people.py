@@ -119,11 +119,9 @@ class Track:
         self._rows = array("d")  # only a few numbers per frame: recordings are long
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self._rows) // _NUMBERS
 
     def add(self, frame: SmplFrame) -> None:
-        """Takes in the next frame."""
         longest = np.linalg.norm(frame.pose, axis=1).max()
         self._rows.extend((longest, 1e-9 * frame.stamp_ns, *frame.pose[0], *frame.transl))
 

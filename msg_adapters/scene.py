@@ -145,7 +145,6 @@ class Scene:
 
     @property
     def persons(self) -> tuple[str, ...]:
-        """The people who are here."""
         with self._changed:
             return tuple(self._seen)
 

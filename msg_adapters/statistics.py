@@ -24,7 +24,6 @@ class Report:
     total: Counter[str]
     recent: Counter[str]
     seconds: float
-    """Time since the last report."""
     latency_ms: tuple[float, float, float]
     """p50, p95, p99 of the last frames, from receipt to publish."""
     largest_shift: float
@@ -65,7 +64,6 @@ class Statistics:
         self._error = ""
 
     def count(self, key: str) -> None:
-        """Counts one more for a key."""
         with self._lock:
             self._total[key] += 1
 

@@ -69,17 +69,11 @@ def encode_transforms(transforms: Sequence[Transform]) -> bytes:
     return writer.to_bytes()
 
 
-def decode_transforms(data: Buffer) -> list[Transform]:
-    """The transforms of a `tf2_msgs/TFMessage`. Raises `DecodeError` for anything that isn't one."""
-    headers, values = _read(data)
-    return [
-        Transform(stamp_ns, parent, child, value[:3], value[3:])
-        for (stamp_ns, parent, child), value in zip(headers, values, strict=True)
-    ]
+def decode_transforms(data: Buffer) -> tuple[list[tuple[Any, ...]], NDArray[np.float64]]:
+    """Stamp [ns], parent and child of each transform, and translations [m] with quaternions, shape (N, 7).
 
-
-def _read(data: Buffer) -> tuple[list[tuple[Any, ...]], NDArray[np.float64]]:
-    """Stamp [ns], parent and child of each transform, and translations [m] with quaternions, shape (N, 7)."""
+    Raises `DecodeError` for anything that isn't a `tf2_msgs/TFMessage`.
+    """
     reader = CdrReader(data)
     headers, values = [], []
     for _ in reader.items(item_bytes=_MIN_TRANSFORM_BYTES):
@@ -106,7 +100,6 @@ class Placement:
         return Placement(self.rotation @ inner.rotation, translation, self.is_late or inner.is_late)
 
     def inverse(self) -> Placement:
-        """The inverse placement."""
         return Placement(self.rotation.T, -(self.rotation.T @ self.translation), self.is_late)
 
 
@@ -166,7 +159,6 @@ class TransformBuffer:
         """Frames that were heard of since others were last forgotten."""
 
     def __len__(self) -> int:
-        """How many frames have a parent."""
         return len(self._tracks)
 
     @property
@@ -184,7 +176,7 @@ class TransformBuffer:
 
         Raises `DecodeError` for anything that isn't such a message.
         """
-        (headers, values), now = _read(data), self._clock()
+        (headers, values), now = decode_transforms(data), self._clock()
         if now >= self._forget_at:
             self._tracks = {name: one for name, one in self._tracks.items() if one.is_static or name in self._heard}
             self._heard, self._forget_at = set(), now + 1e-9 * HISTORY_NS

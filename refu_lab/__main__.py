@@ -5,7 +5,6 @@ import sys
 
 
 def main() -> int:
-    """Runs the command line; returns the exit code."""
     # An exception in the middle of an import may come out as any other, so there an interrupt raises none.
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:

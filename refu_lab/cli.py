@@ -9,85 +9,38 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; more threads would wait for busy cores
 
 from refu_core import RefuError, __version__
 from refu_core._collector import collect_rarely
 from refu_core.errors import printable
-from refu_lab.commands import COMMANDS
-from refu_lab.commands._common import (
-    EXIT_BAD_INPUT,
-    EXIT_BUG,
-    EXIT_CHECK_FAILED,
-    EXIT_INTERRUPTED,
-    EXIT_UNREAD,
-    Parser,
-    add_subcommands,
-    check_writable,
-    require_apart,
-    require_distinct,
-)
+from refu_lab.commands import COMMANDS, _common
+from refu_lab.interrupts import handled, interruptible
 
 _OF_LAB = ("matplotlib", "PIL", "tqdm")
 """Packages of the extra `lab`; any other that may be missing belongs to `train`."""
 
 
-def _parser() -> Parser:
-    parser = Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
+def _parser() -> _common.Parser:
+    parser = _common.Parser(prog="refu", description="Garments on SMPL bodies, free of body-garment collisions.")
     parser.add_argument("--version", action="version", version=f"refu {__version__}")
-    commands = add_subcommands(parser, metavar="COMMAND")
+    commands = _common.add_subcommands(parser, metavar="COMMAND")
     for command in COMMANDS:
         command.add(commands)
     return parser
 
 
-_AGAIN_S = 0.01
-"""After so long an interrupt comes again that was raised in a destructor, where Python only prints it [s]."""
-
-
-def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """A terminated command closes its files like an interrupted one, and no interrupt is lost."""
-    hook = sys.unraisablehook
-
-    def come_again(_signal: int, _frame: FrameType | None) -> None:
-        signal.raise_signal(signal.SIGTERM)  # handled as it is then: it may have to wait for the end of a message
-
-    def unraised(what: Any) -> None:
-        if what.exc_type is KeyboardInterrupt:
-            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-        else:
-            hook(what)
-
-    handlers = {signal.SIGTERM: _interrupt, signal.SIGALRM: come_again}
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    sys.unraisablehook = unraised
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        for number, handler in before.items():
-            signal.signal(number, handler or signal.SIG_DFL)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code."""
     collect_rarely()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal or file that has no → gets a ?
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that it can't write to
-    with _interruptible():
+    # A terminated command closes its files like an interrupted one.
+    with handled({signal.SIGTERM: signal.default_int_handler}):
         return _run(arguments)
 
 
@@ -99,32 +52,33 @@ def _run(arguments: Sequence[str] | None) -> int:
             print(end="", flush=True)
         written = _outputs(args)
         for path in written.values():
-            check_writable(path)
-        require_distinct(written)
+            _common.check_writable(path)
+        _common.require_distinct(written)
         for path in filter(Path.is_file, written.values()):
             for given in _inputs(args, written=path):
-                require_apart(given, path)
-        code: int = args.run(args)
+                _common.require_apart(given, path)
+        with interruptible():
+            code: int = args.run(args)
         print(end="", flush=True)
     except BrokenPipeError:  # who read the output has gone (| head)
-        return EXIT_UNREAD
+        return _common.EXIT_UNREAD
     except RefuError as error:
-        return _failed(f"error: {error}", EXIT_BAD_INPUT)
+        return _failed(f"error: {error}", _common.EXIT_BAD_INPUT)
     except (OSError, UnicodeError, MemoryError, RecursionError) as error:
-        return _failed(f"error: {str(error) or type(error).__name__}", EXIT_BAD_INPUT)
+        return _failed(f"error: {str(error) or type(error).__name__}", _common.EXIT_BAD_INPUT)
     except ModuleNotFoundError as error:  # a package of an extra: every command imports those of the core
         extra = "lab" if str(error.name).partition(".")[0] in _OF_LAB else "train"
-        return _failed(f'error: {error.name} is not installed: pip install "refu-ros[{extra}]"', EXIT_BAD_INPUT)
+        return _failed(f'error: {error.name} is not installed: pip install "refu-ros[{extra}]"', _common.EXIT_BAD_INPUT)
     except KeyboardInterrupt:
-        return _failed("interrupted", EXIT_INTERRUPTED)
+        return _failed("interrupted", _common.EXIT_INTERRUPTED)
     except Exception as error:
         from refu_core._device import is_device_loss
 
         if is_device_loss(error):
-            reason = str(error).splitlines()[0]
-            return _failed(f"error: the device has failed: {reason}; run it again, or on the cpu", EXIT_CHECK_FAILED)
+            what = f"error: the device has failed: {str(error).splitlines()[0]}; run it again, or on the cpu"
+            return _failed(what, _common.EXIT_CHECK_FAILED)
         what = f"{type(error).__name__}: {error}"
-        return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", EXIT_BUG)
+        return _failed(f"a bug of refu, please report it; REFU_DEBUG=1 shows where: {what}", _common.EXIT_BUG)
     finally:
         _drop_unwritable()
     return code
@@ -162,7 +116,7 @@ def _inputs(args: argparse.Namespace, *, written: Path) -> list[Path]:
 
 def _failed(reason: str, code: int) -> int:
     """Prints the reason in one line, with REFU_DEBUG also the traceback; returns the code."""
-    if os.environ.get("REFU_DEBUG") and code != EXIT_INTERRUPTED:
+    if os.environ.get("REFU_DEBUG") and code != _common.EXIT_INTERRUPTED:
         traceback.print_exc()
     print(f"refu: {printable(reason)}", file=sys.stderr)
     return code

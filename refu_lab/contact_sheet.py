@@ -17,7 +17,6 @@ _CLOTH = ((0.36, 0.52, 0.66), (0.72, 0.42, 0.36), (0.42, 0.56, 0.42), (0.62, 0.5
 _TILE = (128, 160)
 """Width and height of one view [pixels]."""
 _COLUMNS = 6
-"""Samples in a row."""
 
 
 def contact_sheet(

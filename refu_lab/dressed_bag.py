@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import msg_adapters as adapters
@@ -15,6 +12,7 @@ from msg_adapters.markers import SKIN
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.realtime import PipelineOutput
 from refu_lab.commands.replay import ReplayOptions
+from refu_lab.interrupts import undisturbed
 from refu_lab.sources import Source
 
 if TYPE_CHECKING:
@@ -36,23 +34,6 @@ def garment_meshes(pipeline: GarmentPipeline, person: str = "") -> list[adapters
         )
         for name, garment in pipeline.garments.items()
     ]
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Delays interrupts until the block ends: a bag that breaks off in the middle of a message can't be read."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    before = {kind: signal.signal(kind, lambda kind, _: came.append(kind)) for kind in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, signal.SIG_DFL if handler is None else handler)
-        for one in dict.fromkeys(came):
-            signal.raise_signal(one)
 
 
 class DressedBag:
@@ -89,12 +70,12 @@ class DressedBag:
 
     def __exit__(self, *error: Any) -> None:
         """Finishes the bag, also after an exception; removes a bag without a frame."""
-        with _undisturbed():
+        with undisturbed():
             if self._is_empty:
                 self._writer.discard()
             self._writer.__exit__(*error)
 
-    @_undisturbed()
+    @undisturbed()
     def add_skip(self, record: FrameRecord, reason: str) -> None:
         """Writes a message as it came, and why it was not replayed."""
         self._skipped += 1
@@ -102,7 +83,7 @@ class DressedBag:
         stamp_ns = min(record.stamp_ns, _LAST_STAMP_NS)  # the stamp may be the reason
         self._say(record, stamp_ns, [self._input(ERROR, reason)])
 
-    @_undisturbed()
+    @undisturbed()
     def add_frame(
         self,
         record: FrameRecord,

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import islice
 from os import PathLike
 from pathlib import Path
@@ -19,14 +17,12 @@ from refu_core import GarmentPipeline, PipelineOutput
 from refu_core._files import replacing
 from refu_core.errors import RefuError
 from refu_core.garments import UvMap
-from refu_core.history import PoseHistory
 from refu_core.recordings import turn_from
 from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN
 from refu_lab.sources import open_source
 
 FORMATS: tuple[str, ...] = (".glb", ".obj", ".usda", ".usdc", ".usd")
-"""Suffixes of the files that can be written."""
 _USD = (".usda", ".usdc", ".usd")
 _FAR = 100.0
 """Farther than this from the origin, float32 has steps of 8 µm and more [m]."""
@@ -62,12 +58,16 @@ def meshes_of(
 
 def require_new(path: Path, count: int) -> None:
     """Raises `RefuError` if a file that `write_meshes` would make of `count` frames is there already."""
-    suffix, number = path.suffix.lower(), "[0-9]" * len(str(count - 1))
-    is_one = count == 1 or suffix in _USD
-    found = path.parent.glob(glob.escape(path.name) if is_one else f"{glob.escape(path.stem)}_{number}{suffix}")
-    there = next(found, None)
+    there = next((one for one in _files(path, count) if one.exists()), None)
     if there is not None:
         raise RefuError(f"{there} is there already: name another file, or --overwrite it")
+
+
+def _files(path: Path, count: int) -> list[Path]:
+    """The files of `count` frames: one for each, numbered if there are several, and one for all in USD."""
+    suffix, digits = path.suffix.lower(), len(str(count - 1))
+    is_one = count == 1 or suffix in _USD
+    return [path] if is_one else [path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
 
 
 def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps: float = 30.0) -> list[Path]:
@@ -92,8 +92,7 @@ def write_meshes(meshes: Sequence[ExportMesh], path: str | PathLike[str], *, fps
         if suffix in _USD:
             _write_usd(meshes, path, fps, origin)
             return [path]
-        digits = len(str(count - 1))
-        paths = [path if count == 1 else path.with_name(f"{path.stem}_{k:0{digits}}{suffix}") for k in range(count)]
+        paths = _files(path, count)
         for k, one in enumerate(paths):
             with replacing(one) as file:
                 file.write(_glb(meshes, k, origin) if suffix == ".glb" else _obj(meshes, k))
@@ -115,10 +114,7 @@ def export(
         write_meshes((), path)
     if not overwrite:
         require_new(path, count)
-    load = cache(options.load_pipeline)
-    source = open_source(options, lambda: load().body)
-    pipeline = load()
-    source.history = PoseHistory() if pipeline.heeds_past else None
+    source = open_source(options)
     frames, outputs, left_out, n_records = [], [], list[str](), 0
     for number, record in enumerate(islice(source.records, first + count)):
         n_records = number + 1
@@ -128,21 +124,21 @@ def export(
             continue
         try:
             frame = source.frame_of(record)
-            outputs.append(pipeline(frame))
+            outputs.append(source.pipeline(frame))
         except RefuError as error:
             left_out.append(f"frame {number} is left out: {error}")
         else:
             frames.append(frame)
     if n_records < first + count:
         left_out.append(f"it has {n_records} frames, wanted number {first} to {first + count - 1}")
-    warnings = [*source.warnings(pipeline), *left_out]
+    warnings = [*source.warnings(), *left_out]
     if not outputs:
         why = left_out[-1]
         raise RefuError(f"{options.input}: has no frame that can be dressed from number {first} on: {why}")
     step = 1e-9 * float(np.median(np.diff([frame.stamp_ns for frame in frames]))) if len(frames) > 1 else 0.0
     fps = round(1 / step, 3) if step > 0 else 30.0
     turn = turn_from(frames[0].up.astype(np.float64))
-    meshes = meshes_of(pipeline, outputs, with_body=with_body)
+    meshes = meshes_of(source.pipeline, outputs, with_body=with_body)
     if turn[1, 1] != 1:
         meshes = [replace(mesh, vertices=mesh.vertices @ turn.T) for mesh in meshes]
     if not overwrite and len(outputs) < count:  # then the files have other names

@@ -11,17 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core import GarmentError, GarmentPipeline, PipelineOutput, SmplFrame, load_body, load_garment
-from refu_core.fitting import (
-    UNITS,
-    FittedGarment,
-    GarmentDetails,
-    Placing,
-    fit_garment,
-    read_surface,
-    standing_pose,
-    stretch,
-)
+from refu_core import GarmentError, GarmentPipeline, PipelineOutput, SmplFrame, fitting, load_body, load_garment
 from refu_core.frames import N_JOINTS
 from refu_core.garments import garment_files, garments_folder, require_name, save_garment
 from refu_core.metrics import CollisionChecker
@@ -46,7 +36,7 @@ def _name_of(mesh: Path) -> str:
 
 def try_on_poses() -> dict[str, NDArray[np.float32]]:
     """A few ordinary poses, by name: rotation vectors [rad], shape (24, 3)."""
-    stand, walk, reach = (standing_pose(arms) for arms in (1.0, 1.1, -0.9))
+    stand, walk, reach = (fitting.standing_pose(arms) for arms in (1.0, 1.1, -0.9))
     walk[1, 0], walk[2, 0], walk[4, 0], walk[5, 0] = -0.45, 0.35, 0.25, 0.55
     walk[16, 1], walk[17, 1] = 0.3, 0.3
     reach[3, 0] = -0.1
@@ -70,15 +60,15 @@ def add_garment(options: AddOptions) -> dict[str, Any]:
         raise GarmentError(f"{target}: a garment is called as its file: leave --name out, or write {options.name}.npz")
     if target.exists() and not options.overwrite:
         raise GarmentError(f"{target} is there already: give it another --name, or --overwrite it")
-    details = GarmentDetails(
+    details = fitting.GarmentDetails(
         options.layer,
-        options.color or GarmentDetails().color,
+        options.color or fitting.GarmentDetails().color,
         options.held_at,
         f"{options.source} ({options.mesh.name}), by refu garment add",
     )
-    body, surface, placing = load_body(options.body), read_surface(options.mesh), _placing(options)
+    body, surface, placing = load_body(options.body), fitting.read_surface(options.mesh), _placing(options)
     try:
-        made = fit_garment(
+        made = fitting.fit_garment(
             surface, body, name=name, placing=placing, details=details, longest_edge=options.longest_edge
         )
     except GarmentError as error:
@@ -112,13 +102,13 @@ def _number(text: str) -> float:
         return float("nan")
 
 
-def _placing(options: AddOptions) -> Placing:
+def _placing(options: AddOptions) -> fitting.Placing:
     unit = None
     if options.unit is not None:
-        unit = UNITS.get(options.unit) or _number(options.unit)
+        unit = fitting.UNITS.get(options.unit) or _number(options.unit)
         if not 1e-6 < unit < 1e6:
-            raise GarmentError(f"no unit {options.unit!r}: wanted {', '.join(UNITS)}, or how many metres it is")
-    return Placing(unit, options.up, _pose(options.pose), options.as_placed)
+            raise GarmentError(f"no unit {options.unit!r}: wanted {', '.join(fitting.UNITS)}, or how many metres it is")
+    return fitting.Placing(unit, options.up, _pose(options.pose), options.as_placed)
 
 
 def _pose(text: str | None) -> NDArray[np.float64] | None:
@@ -135,7 +125,7 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
     if not -90 <= angle <= 90:
         msg = f"no pose {text!r}: wanted t, the angle in degrees that the arms hang down (45), or a motion .npz"
         raise GarmentError(msg)
-    return standing_pose(np.radians(angle))
+    return fitting.standing_pose(np.radians(angle))
 
 
 def dressed(pipeline: GarmentPipeline, output: PipelineOutput) -> list[RenderMesh]:
@@ -144,7 +134,7 @@ def dressed(pipeline: GarmentPipeline, output: PipelineOutput) -> list[RenderMes
     return [RenderMesh(output.body, pipeline.body.faces.numpy()), *worn]
 
 
-def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
+def try_on(made: fitting.FittedGarment) -> dict[str, dict[str, Any]]:
     """For each of a few poses, worn by skinning: the collisions left with the body, and how far it is stretched."""
     pipeline = GarmentPipeline.load([made.template], backbone="skinned")
     checker = CollisionChecker(pipeline.body.faces.numpy())
@@ -155,14 +145,13 @@ def try_on(made: FittedGarment) -> dict[str, dict[str, Any]]:
         mesh = output[made.template.name]
         left = checker.check(mesh.local, mesh.faces)
         rest = made.template.v_template.double().numpy()
-        long = stretch(made.template.faces.numpy(), rest, mesh.local.astype(np.float64))
+        long = fitting.stretch(made.template.faces.numpy(), rest, mesh.local.astype(np.float64))
         stretched = float(np.quantile(long, 0.999))
         found[pose_name] = {"inside": left.n_inside, "pairs": left.n_pairs, "stretch": stretched}
     return found
 
 
 def warnings_of(worn: dict[str, dict[str, Any]]) -> list[str]:
-    """Warnings about a garment that was tried on."""
     found = []
     if (most := max(left["pairs"] for left in worn.values())) > _MOST_CUT:
         found.append(f"{most} of its triangles cut the body: look at it (--picture) before you use it")
@@ -200,7 +189,6 @@ def list_garments() -> list[dict[str, Any]]:
 
 
 def garments_table(rows: list[dict[str, Any]]) -> str:
-    """What `refu garment list` prints."""
     cells = []
     for row in rows:
         if "fault" in row:
@@ -214,7 +202,6 @@ def garments_table(rows: list[dict[str, Any]]) -> str:
 
 
 def added_text(result: dict[str, Any]) -> str:
-    """What `refu garment add` prints."""
     lines = [f"{result['garment']}: {result['vertices']} vertices, for the body {result['body']}"]
     lines += [f"  - {note}" for note in result["notes"]]
     for pose, left in result["worn"].items():

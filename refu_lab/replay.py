@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,11 +20,9 @@ import msg_adapters as adapters
 from msg_adapters import FrameRecord
 from refu_core import GarmentPipeline, RefuError, SmplFrame
 from refu_core._device import one_thread
-from refu_core.history import PoseHistory
 from refu_core.metrics import CollisionChecker, Figures, GarmentMetrics
 from refu_core.modes import BackboneName
 from refu_core.realtime import PipelineOutput
-from refu_lab.commands._common import require_apart
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.dressed_bag import DressedBag, garment_meshes
 from refu_lab.sources import Source, body_facts, open_source
@@ -90,7 +87,6 @@ class ReplayResult:
     source: str
     """What was read: a topic and its type, or a motion file."""
     pipeline: GarmentPipeline
-    """What dressed the frames."""
     frames: list[FrameResult] = field(default_factory=list)
     """The frames that were evaluated."""
     latencies_ms: array[float] = field(default_factory=lambda: array("d"))
@@ -120,7 +116,6 @@ class ReplayResult:
             self.frames.append(FrameResult(frame, latency_ms, output.stats.stage_ms, garments))
 
     def skip(self, reason: str) -> None:
-        """Counts a message that was not replayed."""
         known = reason in self.skips or len(self.skips) < _MAX_REASONS
         self.skips[reason if known else "other reasons"] += 1
 
@@ -136,7 +131,6 @@ class ReplayResult:
         return {"mean": mean, "largest": 1e3 * self.shift_largest}
 
     def as_dict(self) -> dict[str, Any]:
-        """The machine-readable result (`--json`)."""
         garments: dict[str, Any] = {}
         for name, after in self.after.items():
             garments[name] = {
@@ -176,7 +170,6 @@ class Evaluator:
         )
 
     def add(self, frame: SmplFrame, output: PipelineOutput, latency_ms: float) -> dict[str, GarmentRecord]:
-        """Measures one frame."""
         self._checker.update(output.body)
         self._skin.update(output.skin)
         own_ms = {name: output.stats.garments[name].ms for name in output}
@@ -195,7 +188,6 @@ class Evaluator:
         return records
 
     def summarise(self, result: ReplayResult) -> None:
-        """Writes the figures over all frames into a result."""
         result.before, result.after, result.on_skin = (
             {name: metrics.summary() for name, metrics in of.items()}
             for of in (self._before, self._after, self._on_skin)
@@ -206,34 +198,26 @@ class Evaluator:
 def replay(
     options: ReplayOptions,
     *,
-    pipeline: GarmentPipeline | None = None,
     source: Source | None = None,
     progress: bool = False,
     told: Callable[[int, int], object] | None = None,
 ) -> ReplayResult:
     """Runs every frame of the input through the pipeline, writes the output bag, and measures.
 
-    `pipeline` is the result of `options.load_pipeline()`, if that was called already, and `source` that of
-    `open_source`. `progress` shows a bar. `told` is called a few times a second with how many frames are done, and of
-    how many (0 where that isn't known).
+    `source` is what `open_source` makes of the options, if it was called already. `progress` shows a bar. `told` is
+    called a few times a second with how many frames are done, and of how many (0 where that isn't known).
 
     An interrupt (Ctrl-C) ends the replay early: the bag is closed and the result so far is returned. Raises
-    `RefuError`: a bad input file, an unknown garment, an output that can't be written, or no frame that could be
-    replayed.
+    `RefuError`: as `open_source`, an output that can't be written, or no frame that could be replayed.
     """
-    if options.output is not None:
-        require_apart(options.input, options.output)
-    load = cache(lambda: pipeline or options.load_pipeline())
+    source = source or open_source(options)
+    pipeline, options = source.pipeline, replace(options, frame_id=options.frame_id or source.frame_id)
     with ExitStack() as stack:
-        source = source or open_source(options, lambda: load().body)  # first: a bad input is reported at once
-        options = replace(options, frame_id=options.frame_id or source.frame_id)
-        pipeline = load()
         # Compiles the kernels, so that the first frame isn't late; in a pose nobody sends, so none counts as known.
         pipeline(SmplFrame(pose=np.full((24, 3), 1e-3, np.float32)))
         result = ReplayResult(options, source.description, pipeline)
         if options.backbone == BackboneName.AUTO:
             result.warnings += [f"{name} has no trained weights: worn by skinning" for name in pipeline.untrained]
-        source.history = PoseHistory() if pipeline.heeds_past else None
         truth = GroundTruth()
         if options.evaluate and source.bag is not None:
             faces = {name: garment.faces.cpu().numpy() for name, garment in pipeline.garments.items()}
@@ -267,7 +251,7 @@ def replay(
             result.interrupted = True
         if evaluator is not None:
             evaluator.summarise(result)
-        result.warnings += source.warnings(pipeline, betas_are_told=bool(truth.garments))  # truth is on built-in bodies
+        result.warnings += source.warnings(betas_are_told=bool(truth.garments))  # truth is on built-in bodies
     if not result.latencies_ms and not result.interrupted:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in result.skips.most_common(3))
         reasons = reasons or "; ".join(() if source.bag is None else source.bag.reader.warnings)

@@ -64,7 +64,6 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
 
 
 def simulation_table(card: dict[str, Any], output: Path) -> str:
-    """What `refu simulate` prints."""
     counts, share, figures = card["counts"], card["yield"], card.get("figures", {})
     rows = [(name.replace("_", " "), str(number)) for name, number in counts.items()]
     rows += [("yield", f"{100 * share['kept_share']:.1f} %")]

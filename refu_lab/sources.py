@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,9 +33,10 @@ PLACED_BY_TF = "the person stays at the origin of {}: tf says where that is, and
 
 @dataclass(eq=False)
 class Source:
-    """Frames of a bag or of a motion file, as records of one kind."""
+    """Frames of a bag or of a motion file, as records of one kind, and who is dressed in them."""
 
     options: RecordingOptions
+    pipeline: GarmentPipeline
     description: str
     """A topic and its type, or a motion file."""
     topic: str
@@ -53,16 +55,16 @@ class Source:
     is_fitted: bool = False
     """Whether its betas were fitted to the body that wears the garments."""
     frame_id: str = WORLD_FRAME
-    """The frame_id of the output."""
 
     track: adapters.Track = field(default_factory=adapters.Track)
     """Finds what is doubtful in a bag's units, stamps and axes; motion files are checked when they are read."""
-    history: PoseHistory | None = None
-    """Adds its past to each frame, for garments that heed it (`GarmentPipeline.heeds_past`)."""
+    history: PoseHistory | None = field(init=False)
+    """Adds its past to each frame; None where no garment heeds it (`GarmentPipeline.heeds_past`)."""
     has_betas: bool = False
-    """Whether any frame so far had a shape."""
     has_style: bool = False
-    """Whether any frame so far had a style."""
+
+    def __post_init__(self) -> None:
+        self.history = PoseHistory() if self.pipeline.heeds_past else None
 
     def frame_of(self, record: FrameRecord) -> SmplFrame:
         """A record's frame, with the body shape that the options ask for.
@@ -83,9 +85,9 @@ class Source:
         betas = self.options.known_betas
         return frame if betas is None else replace(frame, betas=np.asarray(betas, np.float32))
 
-    def warnings(self, pipeline: GarmentPipeline, *, betas_are_told: bool = False) -> list[str]:
+    def warnings(self, *, betas_are_told: bool = False) -> list[str]:
         """Warnings about the input, the body and its garments; complete after the last record."""
-        options, bag = self.options, self.bag
+        options, bag, pipeline = self.options, self.bag, self.pipeline
         is_told = betas_are_told or options.betas_are_told or pipeline.fit is not None
         is_told = is_told or self.is_fitted or options.input_type in adapters.KEYPOINT_TYPES
         is_told = is_told or (bag is not None and bag.topic.betas_of == BetasSource.BUILTIN)
@@ -100,11 +102,13 @@ class Source:
         ]
 
 
-def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Source:
-    """Opens the input; `body` gives who wears the garments, and is called only if something depends on it.
+def open_source(options: RecordingOptions, pipeline: GarmentPipeline | None = None) -> Source:
+    """Opens the input, and loads the pipeline that the options ask for, unless it is given.
 
-    Raises `RefuError` for an input that can't be read, or with options that don't apply to it.
+    A bad input is reported before torch is imported, where that can be told without a body. Raises `RefuError` for an
+    input that can't be read, or with options that don't apply to it, and as `RecordingOptions.load_pipeline`.
     """
+    load = cache(lambda: pipeline or options.load_pipeline())
     if options.input.suffix.lower() in SUFFIXES:
         if options.topic is not None or options.input_type is not None:
             what = "--topic" if options.topic is not None else "--input-type"
@@ -114,13 +118,14 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
             fps=options.fps,
             axes=options.input_axes,
             person=options.person,
-            worn=Proportions.of_body(body()) if options.input.exists() else None,  # a missing file is reported at once
+            worn=Proportions.of_body(load().body) if options.input.exists() else None,  # else it is reported at once
         )
         description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
         up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None
         kind, decode = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
-        source = Source(options, description, INPUT_TOPIC, kind, decode, _motion_records(motion), len(motion))
-        return replace(source, notes=motion.notes, gender=motion.gender, is_fitted=motion.is_fitted)
+        read = description, INPUT_TOPIC, kind, decode, _motion_records(motion), len(motion)
+        said: dict[str, Any] = {"notes": motion.notes, "gender": motion.gender, "is_fitted": motion.is_fitted}
+        return Source(options, load(), *read, **said)
     if options.fps is not None or options.input_axes in ("z-up", "y-down"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
         msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)})"
@@ -134,13 +139,14 @@ def open_source(options: RecordingOptions, body: Callable[[], SmplBody]) -> Sour
     given, is_placed = _frame_of_first(bag)
     notes = [PLACED_BY_TF.format(given)] if is_placed else []
     if bag.decoder is None:
-        decode = _follower(options, body(), notes)
+        decode = _follower(options, load().body, notes)
     else:
         input_type = bag.decoder.input_type
         is_smpl = options.axes == "smpl"
         decode = _decoding(bag.decoder, lambda data: None if is_smpl else up_of(adapters.frame_id_of(data, input_type)))
-    found = Source(options, f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count, bag, notes)
-    return replace(found, frame_id=given) if given and (is_placed or options.axes == "frame") else found
+    frame_id = given if given and (is_placed or options.axes == "frame") else WORLD_FRAME
+    read = f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count
+    return Source(options, load(), *read, bag, notes, frame_id=frame_id)
 
 
 def _frame_of_first(bag: adapters.SmplBag) -> tuple[str, bool]:

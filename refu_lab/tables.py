@@ -34,7 +34,6 @@ class TextTable:
     """What a reader has to know."""
 
     def text(self) -> str:
-        """The table for a terminal, under its title."""
         return f"{self.title}\n{format_table(self.header, self.rows)}"
 
     def markdown(self) -> str:
@@ -79,7 +78,6 @@ def html_page(title: str, body: str, *, style: str) -> str:
 
 
 def picture_markdown(file: str, caption: str) -> str:
-    """A picture and its caption."""
     return f"![{caption}]({file})\n\n*{caption}*"
 
 
@@ -103,7 +101,6 @@ def _write(path: Path, text: str) -> None:
 
 
 def replay_table(result: ReplayResult) -> str:
-    """What `refu replay` prints."""
     header, rows = replay_columns(result.as_dict()["garments"])
     table = ["", format_table(header, rows), "", fill(meanings(header), 120), ""] if rows else []
     lines = [f"{result.options.input}: {result.source}", *table]
@@ -143,7 +140,6 @@ _FOLDS = ("folds_1", "folds_4", "folds_16", "folds_64")
 
 
 def meanings(header: Sequence[str]) -> str:
-    """What the columns of a replay's table say."""
     return "; ".join(text for column, text in _MEANINGS.items() if column in header)
 
 

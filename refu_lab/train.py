@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from refu_core import RefuError, load_garment
+from refu_core import RefuError, load_garment, training
 from refu_core._device import checked_device
 from refu_core._files import exclusive
 from refu_core.backbones import PRESETS
@@ -18,21 +18,6 @@ from refu_core.garments import worn_on
 from refu_core.options import check
 from refu_core.sdf import SDF_PRESETS
 from refu_core.simulation import GarmentDataset, GarmentSequences, load_clips, open_dataset
-from refu_core.training import (
-    CarrySettings,
-    DynamicsSettings,
-    FinetuneSettings,
-    LyingSettings,
-    PretrainSettings,
-    Rehearsal,
-    SdfSettings,
-    carry_over,
-    finetune,
-    pretrain,
-    train_dynamics,
-    train_lying,
-    train_sdf,
-)
 from refu_lab.commands.train import TrainOptions
 from refu_lab.tables import format_table
 
@@ -64,41 +49,41 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
     if options.network == "sdf":
         assert isinstance(dataset, GarmentDataset)  # `train` has opened it as one
-        to_sdf = replace(SdfSettings.of(options.preset), seed=options.seed, **steps)
-        return train_sdf(dataset, body, template, options.folder, settings=to_sdf, **common)
+        to_sdf = replace(training.SdfSettings.of(options.preset), seed=options.seed, **steps)
+        return training.train_sdf(dataset, body, template, options.folder, settings=to_sdf, **common)
     common["body"] = body
     given = template, dataset, options.folder
     motions = options.motions and load_clips(options.motions, axes=options.input_axes, fps=options.fps)
-    rehearsal = None if options.rehearse is None else Rehearsal(options.rehearse, motions)
+    rehearsal = None if options.rehearse is None else training.Rehearsal(options.rehearse, motions)
     if options.network == "dynamics":
-        moving = _seeded(DynamicsSettings(), options, **steps)
-        return train_dynamics(*given, mode=options.mode, settings=moving, **common)
+        moving = _seeded(training.DynamicsSettings(), options, **steps)
+        return training.train_dynamics(*given, mode=options.mode, settings=moving, **common)
     if options.network == "lying":
         assert rehearsal is not None  # `_check` has seen to it
-        to_lie = _seeded(LyingSettings(), options, **steps)
-        return train_lying(*given, mode=options.mode, rehearsal=rehearsal, settings=to_lie, **common)
+        to_lie = _seeded(training.LyingSettings(), options, **steps)
+        return training.train_lying(*given, mode=options.mode, rehearsal=rehearsal, settings=to_lie, **common)
     if options.like is not None:
-        few = _seeded(CarrySettings(), options, **steps)
-        return carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
+        few = _seeded(training.CarrySettings(), options, **steps)
+        return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
     common |= {"backbone": options.backbone, "preset": options.preset}
     of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
-    first = PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
+    first = training.PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
     first = _seeded(first, options, **of_all)
     if options.start is not None:
         common |= {"start": options.start, "mode": options.mode, "joints": _numbers(options.joints)}
-        return pretrain(*given, settings=first, rehearsal=rehearsal, **common)
+        return training.pretrain(*given, settings=first, rehearsal=rehearsal, **common)
     if options.mode == "none":
-        return pretrain(*given, settings=first, **common)
+        return training.pretrain(*given, settings=first, **common)
     source: Path | None = options.folder
     if options.backbone == "gcnn":
         source = None
     elif not (options.folder / f"{options.backbone}-none.json").exists():
-        pretrain(*given, settings=first, **common)
+        training.pretrain(*given, settings=first, **common)
     changes: dict[str, Any] = {"scale": None} if options.scale == "fixed" else {"scale_kind": options.scale}
     changes |= {} if options.margin is None else {"margin": options.margin}
     changes |= {"is_blended": False} if options.unblended else {}
-    last = _seeded(FinetuneSettings.of(options.backbone, options.preset), options, **changes, **steps)
-    return finetune(template, dataset, source, options.folder, mode=options.mode, settings=last, **common)
+    last = _seeded(training.FinetuneSettings.of(options.backbone, options.preset), options, **changes, **steps)
+    return training.finetune(template, dataset, source, options.folder, mode=options.mode, settings=last, **common)
 
 
 def _check(options: TrainOptions) -> None:
@@ -138,7 +123,6 @@ def _seeded(settings: Any, options: TrainOptions, **changes: Any) -> Any:
 
 
 def training_table(card: dict[str, Any], options: TrainOptions) -> str:
-    """What `refu train` prints."""
     named = [name for name in ("backbone", "mode", "preset", "like") if name in card]
     rows: list[tuple[str, str]] = [(name, str(card[name])) for name in named]
     # Mirrored ones count, too, where they were learnt from.

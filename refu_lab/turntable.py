@@ -44,8 +44,6 @@ _SCRIPT = Path(__file__).with_suffix(".js")
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame and its captions."""
-
     name: str
     title: str
     before: Sequence[RenderMesh]

@@ -64,14 +64,12 @@ class Bank:
         return str(self._publishers[topic].topic_name)
 
     def watchers(self, topic: str) -> int:
-        """How many subscribe to a topic."""
         with contextlib.suppress(InvalidHandle):  # destroyed meanwhile
             if (publisher := self._publishers.get(topic)) is not None:
                 return int(publisher.get_subscription_count())
         return 0
 
     def is_watched(self) -> bool:
-        """Whether anybody subscribes to anything."""
         return any(self.watchers(topic) for topic in [*self._publishers])
 
     def send(self, topic: str, data: bytes) -> None:

@@ -77,7 +77,6 @@ class PipelineLoader:
     ) -> None:
         self._use, self._fail, self._threads = use, fail, threads
         self.wanted: PipelineOptions | None = None
-        """What was asked for last."""
         self._pool = ThreadPoolExecutor(1, "loader")
 
     def request(self, options: PipelineOptions) -> None:

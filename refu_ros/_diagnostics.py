@@ -30,15 +30,12 @@ class Situation:
     node: str
     """The node's name with its namespace."""
     state: str
-    """The lifecycle's state."""
     persons: Sequence[str]
-    """The people in the scene."""
     recording: RecorderState | None
     recording_error: str
     listening_for: float | None = math.inf
     """Time since the inputs were subscribed to [s]; None where they aren't."""
     in_use: PipelineOptions | None = None
-    """The options of the pipeline in use."""
     input_frame: str = ""
     """The sender's frame, where it isn't the markers'."""
     is_untransformed: bool = False
@@ -46,11 +43,9 @@ class Situation:
     has_foreign_betas: bool = False
     """Whether betas have come without anything saying whose shape space they belong to."""
     doubted: str = ""
-    """What is doubted of the input."""
     has_no_clock: bool = False
     """Whether the clock is that of a simulation that hasn't begun."""
     n_namesakes: int = 0
-    """How many other nodes have this name."""
 
 
 def statuses(report: Report, settings: NodeSettings, now: Situation) -> list[DiagnosticStatus]:

@@ -123,7 +123,6 @@ class Listener:
             self._follow_humans()
 
     def subscribe(self) -> None:
-        """Listens from now on."""
         self.since = self._wanted_at = time.monotonic()
         if self._settings.follow_humans:
             self._listen_to_tracked()
@@ -135,7 +134,6 @@ class Listener:
             self._hear("/camera", adapters.CAMERA_INFO, topic, self._on_camera, ros_qos(INPUT_QOS))
 
     def unsubscribe(self) -> None:
-        """Stops listening."""
         if self._inputs:
             self._node.get_logger().info("listening to nobody")
         for name, subscription in self._inputs.items():

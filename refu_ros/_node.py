@@ -82,14 +82,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     @property
     def is_active(self) -> bool:
-        """Whether people are dressed."""
         return self._state == "active"
 
     # Lifecycle ------------------------------------------------------------------------------------
 
     @transition
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Loads the garments."""
         try:
             interface(self._listener.stream.message_type)
             self._take(load(self.settings, threads=self.settings.threads), self.settings.pipeline)
@@ -135,7 +133,6 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     @transition
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forgets the garments."""
         self._cleanup()
         return super().on_cleanup(state)
 
@@ -322,7 +319,6 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
                 self.get_logger().warning(text, throttle_duration_sec=60.0)
 
     def _report(self) -> None:
-        """Says how the node is."""
         report = self.statistics.report()
         recording, error = self.recording.state()
         scene, since = self._listener.scene, self._listener.since

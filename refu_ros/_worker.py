@@ -96,7 +96,6 @@ class Worker:
         self._threads = [threading.Thread(target=self._run, name=f"inference {i}") for i in range(settings.threads)]
 
     def start(self) -> None:
-        """Starts the threads."""
         for thread in self._threads:
             thread.start()
 
@@ -187,7 +186,6 @@ class Worker:
         return replace(frame, past=self._history(replace(frame, pose=pose, transl=place), person).past)
 
     def _finish(self, batch: _Batch, outputs: Mapping[str, PipelineOutput]) -> None:
-        """Sends what came of a batch."""
         self._remove(batch.gone)
         found, unresolved = self._remember(batch, outputs)
         dressed = {person: frame for person, frame in batch.frames.items() if person in self._dressed}

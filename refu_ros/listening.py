@@ -50,7 +50,6 @@ class LiveTopics:
         self.close()
 
     def close(self) -> None:
-        """Stops listening."""
         self._executor.shutdown()
         self._thread.join()
         self._node.destroy_node()

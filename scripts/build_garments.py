@@ -96,7 +96,6 @@ def shorts_ease(p: Vertices) -> NDArray[np.float64]:
 
 
 def skirt_ease(p: Vertices) -> NDArray[np.float64]:
-    """Close at the waist."""
     return 0.0075 + 0.0065 * ramp(p[:, 1], -0.12, -0.28)
 
 
@@ -114,6 +113,22 @@ _PROVENANCE = (
     "MakeHuman's clothes helpers, targets and skinning weights (CC0 1.0), cut and draped by scripts/build_garments.py, "
     "styles by scripts/build_styles.py; CC0 1.0"
 )
+
+
+def card(
+    layer: int, color: tuple[float, float, float], joints: tuple[int, ...], styles: dict[str, tuple[float, float]]
+) -> GarmentCard:
+    """A card; `styles` are mean and standard deviation of each tailoring parameter [m]."""
+    return GarmentCard(
+        layer=layer,
+        color=color,
+        joints=joints,
+        held_at_waist=joints == _BELOW,
+        tailoring=tuple(Tailoring(name, *spread) for name, spread in styles.items()),
+        provenance=_PROVENANCE,
+    )
+
+
 GARMENTS = (
     Garment(
         name="shirt-male",
@@ -128,18 +143,11 @@ GARMENTS = (
         vertices=9723,
         ease=shirt_ease,
         skin_smoothing=12,
-        card=GarmentCard(
-            layer=2,
-            color=(0.36, 0.55, 0.78),
-            joints=(*_TRUNK, 16, 17, 18, 19, 20, 21),
-            held_at_waist=False,
-            tailoring=(
-                Tailoring("length", 0.0, 0.03),
-                Tailoring("sleeve_length", -0.01, 0.02),
-                Tailoring("ease", 0.012, 0.004),
-                Tailoring("neckline", 0.008, 0.007),
-            ),
-            provenance=_PROVENANCE,
+        card=card(
+            2,
+            (0.36, 0.55, 0.78),
+            (*_TRUNK, 16, 17, 18, 19, 20, 21),
+            {"length": (0.0, 0.03), "sleeve_length": (-0.01, 0.02), "ease": (0.012, 0.004), "neckline": (0.008, 0.007)},
         ),
     ),
     Garment(
@@ -155,18 +163,11 @@ GARMENTS = (
         vertices=7702,
         ease=tshirt_ease,
         skin_smoothing=12,
-        card=GarmentCard(
-            layer=1,
-            color=(0.25, 0.62, 0.57),
-            joints=(*_TRUNK, 16, 17, 18, 19),
-            held_at_waist=False,
-            tailoring=(
-                Tailoring("length", 0.0, 0.03),
-                Tailoring("sleeve_length", 0.0, 0.025),
-                Tailoring("ease", 0.012, 0.004),
-                Tailoring("neckline", 0.010, 0.008),
-            ),
-            provenance=_PROVENANCE,
+        card=card(
+            1,
+            (0.25, 0.62, 0.57),
+            (*_TRUNK, 16, 17, 18, 19),
+            {"length": (0.0, 0.03), "sleeve_length": (0.0, 0.025), "ease": (0.012, 0.004), "neckline": (0.010, 0.008)},
         ),
     ),
     Garment(
@@ -177,18 +178,11 @@ GARMENTS = (
         vertices=2710,
         ease=shorts_ease,
         skin_smoothing=4,
-        card=GarmentCard(
-            layer=0,
-            color=(0.30, 0.34, 0.47),
-            joints=_BELOW,
-            held_at_waist=True,
-            tailoring=(
-                Tailoring("length", 0.0, 0.03),
-                Tailoring("flare", 0.008, 0.008),
-                Tailoring("ease", 0.007, 0.003),
-                Tailoring("rise", 0.0, 0.010),
-            ),
-            provenance=_PROVENANCE,
+        card=card(
+            0,
+            (0.30, 0.34, 0.47),
+            _BELOW,
+            {"length": (0.0, 0.03), "flare": (0.008, 0.008), "ease": (0.007, 0.003), "rise": (0.0, 0.010)},
         ),
     ),
     Garment(
@@ -199,18 +193,11 @@ GARMENTS = (
         vertices=7130,
         ease=skirt_ease,
         skin_smoothing=60,
-        card=GarmentCard(
-            layer=0,
-            color=(0.80, 0.40, 0.42),
-            joints=_BELOW,
-            held_at_waist=True,
-            tailoring=(
-                Tailoring("length", 0.0, 0.04),
-                Tailoring("flare", 0.02, 0.022),
-                Tailoring("ease", 0.005, 0.004),
-                Tailoring("rise", 0.0, 0.010),
-            ),
-            provenance=_PROVENANCE,
+        card=card(
+            0,
+            (0.80, 0.40, 0.42),
+            _BELOW,
+            {"length": (0.0, 0.04), "flare": (0.02, 0.022), "ease": (0.005, 0.004), "rise": (0.0, 0.010)},
         ),
         flare=skirt_flare,
     ),

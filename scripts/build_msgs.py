@@ -57,8 +57,7 @@ def key() -> str:
 def build(folder: Path) -> None:
     """Leaves the Python package in a folder, whole or not at all. Raises `BuildError`."""
     if any(shutil.which(compiler) is None for compiler in ("gcc", "g++")):
-        msg = "a C and a C++ compiler are missing (gcc, g++)"
-        raise MissingError(msg)
+        raise MissingError("a C and a C++ compiler are missing (gcc, g++)")
     prefix = Path(sys.prefix)
     os.environ["AMENT_PREFIX_PATH"] = str(prefix)  # where the generators look for their templates
     folder.mkdir(parents=True, exist_ok=True)
@@ -139,8 +138,7 @@ def _compile(code: Path, prefix: Path) -> None:
 def _run(command: list[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "LC_ALL": "C"})
     if done.returncode:
-        msg = f"{' '.join(command[:1])} failed on {command[-3]}:\n{done.stderr[-2000:]}"
-        raise BuildError(msg)
+        raise BuildError(f"{' '.join(command[:1])} failed on {command[-3]}:\n{done.stderr[-2000:]}")
 
 
 def main() -> int:

@@ -198,7 +198,6 @@ def main() -> None:
 
 
 def build(pattern: Pattern, body: SmplBody) -> tuple[Vertices, Faces]:
-    """Cuts, drapes and meshes a garment."""
     v, f = body.v_template.double().numpy(), body.faces.numpy()
     cuts = pattern.cuts
     if pattern.skirt is not None:  # the cloth leaves the skin above the legs, and goes on from there

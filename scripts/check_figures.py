@@ -20,6 +20,7 @@ from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet.replay import pipeline_for
 from refu_lab.replay import replay
 from refu_lab.reproduction import METRICS
+from refu_lab.sources import open_source
 from refu_lab.tables import write_json
 from refu_lab.truth import garments_of
 
@@ -42,7 +43,7 @@ def figures_of(bag: Path) -> Figures:
     for backbone, sdf in MODES:
         garments = tuple(garments_of(bag)) or DEFAULT_GARMENTS
         options = ReplayOptions(input=bag, max_frames=FRAMES, garments=garments, backbone=backbone, sdf=sdf)
-        result = replay(options, pipeline=pipeline_for(options))
+        result = replay(options, source=open_source(options, pipeline_for(options)))
         for garment in options.garments:
             methods = {backbone: result.before[garment], f"node, {backbone}, {sdf}": result.after[garment]}
             for (method, figures), metric in product(methods.items(), TOLERANCES):

@@ -62,8 +62,6 @@ ACCEPTED: dict[str, str] = {}
 
 @dataclass(frozen=True)
 class Dependency:
-    """One installed distribution."""
-
     name: str
     version: str
     licence: str
@@ -153,8 +151,7 @@ def lock() -> None:
     ).stdout
     match = re.search(r"^torch==(\S+).*\n", resolved, re.MULTILINE)
     if match is None:
-        msg = "no version of torch was resolved"
-        raise SystemExit(msg)
+        raise SystemExit("no version of torch was resolved")
     hashes = sorted(
         {taken for python in PYTHONS for taken in _taken(f"torch=={match[1]}", python)} - {*resolved.split()}
     )

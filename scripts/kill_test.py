@@ -211,8 +211,6 @@ def require(condition: object, what: str) -> None:
 
 @dataclass
 class Result:
-    """The outcome of the kills."""
-
     kills: int = 0
     finished: int = 0
     """Runs that were finished, interrupted or not, and compared with the uninterrupted one."""

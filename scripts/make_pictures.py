@@ -38,7 +38,6 @@ IMAGES = ROOT / "docs" / "images"
 
 
 def save_jpeg(image: NDArray[np.uint8], name: str) -> None:
-    """Writes docs/images/NAME.jpg."""
     Image.fromarray(image).save(IMAGES / f"{name}.jpg", quality=88, optimize=True)
 
 
@@ -80,7 +79,6 @@ PEOPLE = (
 
 
 def recorded(bag: str) -> list[SmplFrame]:
-    """The frames of a shipped bag."""
     return [record.frame for record in adapters.iter_smpl_frames(ROOT / "bags" / bag) if record.frame is not None]
 
 

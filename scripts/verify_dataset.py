@@ -65,12 +65,10 @@ class Verdict:
 
     @property
     def is_good(self) -> bool:
-        """Whether nothing is wrong with it."""
         return not (self.body_pairs or self.inside or self.self_pairs) and not self.is_stretched
 
     @property
     def is_stretched(self) -> bool:
-        """Whether it is stretched more than the set allows."""
         return self.stretch > self.most_stretch
 
 

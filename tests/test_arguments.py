@@ -22,11 +22,13 @@ from refu_core import GarmentPipeline, RefuError
 from refu_core._device import checked_device
 from refu_lab import cli
 from refu_lab.cli import main
+from refu_lab.commands import _common
 from refu_lab.commands._common import numbers, tell
 from refu_lab.render import save_png
 from refu_lab.replay import _paced
 from refu_lab.tables import REPLAY_TITLE, html_page
 from tests.core.test_files import SPECIAL
+from tests.lab.test_interrupts import Interrupting
 from tests.virtual_time import VirtualTime
 
 BAG = str(Path(__file__).parents[1] / "bags" / "walk")
@@ -242,7 +244,7 @@ def test_whose_reader_has_gone_ends_quietly(arguments: list[str], *, buffered: b
     environment = os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"}
     done = subprocess.run([*REFU, *arguments], env=environment, stdout=write, stderr=subprocess.PIPE, check=False)
     os.close(write)
-    assert (done.returncode in (0, cli.EXIT_UNREAD), done.stderr) == (True, b"")
+    assert (done.returncode in (0, _common.EXIT_UNREAD), done.stderr) == (True, b"")
 
 
 def test_output_that_cannot_be_written_is_one_line() -> None:
@@ -336,22 +338,12 @@ def test_a_bug_is_one_line_and_shows_where_it_is_when_asked(
         raise KeyError("it\x1b[2J")
 
     monkeypatch.setattr("refu_lab.info.collect", collect)
-    assert main(["info"]) == cli.EXIT_BUG
+    assert main(["info"]) == _common.EXIT_BUG
     said = capsys.readouterr().err
     assert said == r"refu: a bug of refu, please report it; REFU_DEBUG=1 shows where: KeyError: 'it\x1b[2J'" + "\n"
     monkeypatch.setenv("REFU_DEBUG", "1")
-    assert main(["info"]) == cli.EXIT_BUG
+    assert main(["info"]) == _common.EXIT_BUG
     assert "in collect" in capsys.readouterr().err
-
-
-class Interrupting:
-    """What is interrupted while it goes: an array of Warp's, for instance."""
-
-    def __init__(self, number: signal.Signals) -> None:
-        self._number = number
-
-    def __del__(self) -> None:
-        signal.raise_signal(self._number)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -365,7 +357,7 @@ def test_an_interrupt_is_not_lost_in_a_destructor(
         time.sleep(60)
 
     monkeypatch.setattr("refu_lab.info.collect", collect)
-    assert main(["info"]) == cli.EXIT_INTERRUPTED
+    assert main(["info"]) == _common.EXIT_INTERRUPTED
     assert capsys.readouterr().err == "refu: interrupted\n"
 
 

@@ -76,8 +76,9 @@ class McapWriter:
         self._chunk = _Chunk()
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
-        self._counts: dict[int, int] = {}
-        self._first_ns, self._last_ns = 0, 0
+        self.counts: dict[int, int] = {}
+        """Messages of each channel that has any."""
+        self.first_ns, self.last_ns = 0, 0
         self._chunk_indexes: list[bytes] = []
         self._metadata_indexes: list[bytes] = []
         self._thread = ThreadPoolExecutor(1, "bag") if in_background else None
@@ -98,16 +99,15 @@ class McapWriter:
         self._add(self._channels[-1])
         return number
 
-    def add_message(self, channel: int, data: bytes, *, log_time_ns: int, sequence: int) -> None:
-        """Appends a message to the chunk under way."""
-        n_earlier = sum(self._counts.values())
-        self._first_ns = min(self._first_ns, log_time_ns) if n_earlier else log_time_ns
-        self._last_ns = max(self._last_ns, log_time_ns)
-        self._counts[channel] = self._counts.get(channel, 0) + 1
+    def add_message(self, channel: int, data: bytes, *, log_time_ns: int) -> None:
+        self.first_ns = min(self.first_ns, log_time_ns) if self.counts else log_time_ns
+        self.last_ns = max(self.last_ns, log_time_ns)
+        sequence = self.counts.get(channel, 0)
+        self.counts[channel] = sequence + 1
         self._chunk.times.append(log_time_ns)
         self._chunk.index.setdefault(channel, []).append(struct.pack("<QQ", log_time_ns, self._chunk.size))
         length = _MESSAGE_FIELDS_BYTES + len(data)
-        head = _MESSAGE.pack(MESSAGE, length, channel, sequence, log_time_ns, log_time_ns)
+        head = _MESSAGE.pack(MESSAGE, length, channel, sequence & 0xFFFFFFFF, log_time_ns, log_time_ns)
         self._add(head, bytes(data))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -131,14 +131,14 @@ class McapWriter:
         start = self._stream.tell()
         statistics = struct.pack(
             "<QHIIIIQQ",
-            sum(self._counts.values()),
+            sum(self.counts.values()),
             *(len(self._schemas), len(self._channels), 0, len(self._metadata_indexes), len(self._chunk_indexes)),
-            *(self._first_ns, self._last_ns),
+            *(self.first_ns, self.last_ns),
         )
         groups = {
             SCHEMA: self._schemas,
             CHANNEL: self._channels,
-            STATISTICS: [_record(STATISTICS, statistics, _number_map(self._counts))],
+            STATISTICS: [_record(STATISTICS, statistics, _number_map(self.counts))],
             CHUNK_INDEX: self._chunk_indexes,
             0x0A: [],  # index of attachments
             METADATA_INDEX: self._metadata_indexes,

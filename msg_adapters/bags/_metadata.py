@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -39,7 +39,6 @@ class QosProfile:
     depth: int = 10
 
     def to_metadata(self) -> dict[str, Any]:
-        """The profile as rosbag2 writes it."""
         return {
             "history": "keep_last",
             "depth": self.depth,
@@ -74,15 +73,13 @@ class TopicInfo:
     """Whose shape space the messages' β belong to: `builtin`, or empty where the bag doesn't say."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class TopicSummary:
-    """A topic's entry in the metadata."""
-
     name: str
     message_type: str
     type_hash: str
     qos: QosProfile
-    message_count: int = 0
+    channel: int
 
 
 class _Dumper(yaml.SafeDumper):
@@ -129,13 +126,15 @@ def _dump(value: Any) -> str:
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
 
-def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: int, end_ns: int) -> tuple[str, str]:
+def dump_metadata(
+    *, file_name: str, topics: Sequence[TopicSummary], counts: Mapping[int, int], start_ns: int, end_ns: int
+) -> tuple[str, str]:
     """Describe a bag of one file for rosbag2: the texts of metadata.yaml and of the MCAP file's own metadata record.
 
     rosbag2 wants the bare mapping in the record, and the same mapping under one key in metadata.yaml. Times are log
-    times [ns].
+    times [ns], `counts` the messages of each channel.
     """
-    count = sum(topic.message_count for topic in topics)
+    count = sum(counts.values())
     duration = {"nanoseconds": end_ns - start_ns}
     start = {"nanoseconds_since_epoch": start_ns}
     information = {
@@ -153,7 +152,7 @@ def dump_metadata(*, file_name: str, topics: Sequence[TopicSummary], start_ns: i
                     "offered_qos_profiles": [topic.qos.to_metadata()],
                     "type_description_hash": topic.type_hash,
                 },
-                "message_count": topic.message_count,
+                "message_count": counts.get(topic.channel, 0),
             }
             for topic in topics
         ],

@@ -33,7 +33,6 @@ class RecorderState:
     queued: int
     dropped: int
     size_bytes: int
-    """Size of the file so far."""
     free_bytes: int | None
     """Free space on the disk; None where that can't be known."""
     error: str

@@ -9,22 +9,14 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+from msg_adapters.bags import _metadata
 from msg_adapters.bags._mcap_writer import McapWriter
-from msg_adapters.bags._metadata import (
-    BETAS_OF,
-    MAX_TIME_NS,
-    METADATA_FILE,
-    QosProfile,
-    TopicSummary,
-    dump_metadata,
-    read_file_paths,
-)
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
 
 LIBRARY = "refu-ros"
 """The writer's name in a bag, within its first 64 bytes."""
-_DEFAULT_QOS = QosProfile()
+_DEFAULT_QOS = _metadata.QosProfile()
 _PARTIAL = ".partial"
 """Suffix of files that aren't complete yet."""
 
@@ -60,9 +52,7 @@ class BagWriter:
         """Files and folders that this writer made, in order."""
         self._entered: list[Path] = []
         """Directories with entries that a power cut could still lose."""
-        self._topics: dict[str, TopicSummary] = {}
-        self._channels: dict[str, int] = {}
-        self._start_ns, self._end_ns = MAX_TIME_NS, 0
+        self._topics: dict[str, _metadata.TopicSummary] = {}
         self._finished = False
         try:
             with self._writing():
@@ -92,7 +82,7 @@ class BagWriter:
         *,
         definition: str | None = None,
         type_hash: str | None = None,
-        qos: QosProfile = _DEFAULT_QOS,
+        qos: _metadata.QosProfile = _DEFAULT_QOS,
         betas_of: str = "",
     ) -> None:
         """Declare a topic before its first message; declaring it again with the same type does nothing.
@@ -114,10 +104,10 @@ class BagWriter:
             builtin = message_definition(message_type)
             definition, type_hash = builtin.text, type_hash or builtin.type_hash
         metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": type_hash or ""}
-        metadata |= {BETAS_OF: betas_of} if betas_of else {}
+        metadata |= {_metadata.BETAS_OF: betas_of} if betas_of else {}
         with self._writing():
-            self._channels[topic] = self._writer.add_channel(topic, message_type, definition, metadata)
-        self._topics[topic] = TopicSummary(topic, message_type, type_hash or "", qos)
+            channel = self._writer.add_channel(topic, message_type, definition, metadata)
+        self._topics[topic] = _metadata.TopicSummary(topic, message_type, type_hash or "", qos, channel)
 
     def write(self, topic: str, data: bytes, *, log_time_ns: int) -> None:
         """Append a message in CDR, sent and received at `log_time_ns`.
@@ -126,14 +116,10 @@ class BagWriter:
         """
         if topic not in self._topics:
             raise BagError(f"{self.path}: {topic} isn't declared; call add_topic first")
-        if not 0 <= log_time_ns <= MAX_TIME_NS:
+        if not 0 <= log_time_ns <= _metadata.MAX_TIME_NS:
             raise BagError(f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}")
         with self._writing():
-            sequence = self._topics[topic].message_count & 0xFFFFFFFF
-            self._writer.add_message(self._channels[topic], data, log_time_ns=log_time_ns, sequence=sequence)
-        self._topics[topic].message_count += 1
-        self._start_ns = min(self._start_ns, log_time_ns)
-        self._end_ns = max(self._end_ns, log_time_ns)
+            self._writer.add_message(self._topics[topic].channel, data, log_time_ns=log_time_ns)
 
     def sync(self) -> None:
         """Bring everything that was written so far to the disk, where it survives a power cut and can be read.
@@ -153,9 +139,9 @@ class BagWriter:
         """
         if self._finished:
             return
-        start_ns, topics = min(self._start_ns, self._end_ns), [*self._topics.values()]
-        name, end_ns = self.file_path.name, self._end_ns
-        text, record = dump_metadata(file_name=name, topics=topics, start_ns=start_ns, end_ns=end_ns)
+        name, topics, written = self.file_path.name, [*self._topics.values()], self._writer
+        times = {"start_ns": written.first_ns, "end_ns": written.last_ns}
+        text, record = _metadata.dump_metadata(file_name=name, topics=topics, counts=written.counts, **times)
         with self._writing():
             self._writer.add_metadata("rosbag2", {"serialized_metadata": record})
             self._writer.finish()
@@ -169,12 +155,12 @@ class BagWriter:
                 _entries_to_disk(self._target.parent)
             if self._directory is not None:
                 # Written under another name first: a reader never sees half of it.
-                partial = self._directory / f"{METADATA_FILE}{_PARTIAL}"
+                partial = self._directory / f"{_metadata.METADATA_FILE}{_PARTIAL}"
                 with partial.open("w", encoding="utf-8") as file:
                     file.write(text)
                     file.flush()
                     _to_disk(file.fileno())
-                partial.replace(self._directory / METADATA_FILE)
+                partial.replace(self._directory / _metadata.METADATA_FILE)
                 _entries_to_disk(self._directory)
 
     def discard(self) -> None:
@@ -218,9 +204,9 @@ class BagWriter:
     def _own_files(self, directory: Path, *, overwrite: bool) -> list[Path]:
         """The files of the bag in a directory; raises `BagError` if it mustn't be replaced, or isn't alone there."""
         found = [*directory.iterdir()]
-        own = {f"{directory.absolute().name}_0.mcap", METADATA_FILE}
+        own = {f"{directory.absolute().name}_0.mcap", _metadata.METADATA_FILE}
         with suppress(BagError):
-            own |= {file.name for file in read_file_paths(directory)}
+            own |= {file.name for file in _metadata.read_file_paths(directory)}
         others = [file.name for file in found if file.name.removesuffix(_PARTIAL) not in own]
         if found and (others or not overwrite):
             foreign = f"it holds other files than a bag's: {others[0]}" if overwrite else ""

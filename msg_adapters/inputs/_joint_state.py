@@ -142,7 +142,6 @@ a sender names its joints the same way in all of its messages."""
 
 
 def from_bytes(data: Buffer) -> SmplFrame:
-    """The frame of a message in CDR."""
     global _last  # a single assignment: another thread's at the same time does no harm
     with decoding(MESSAGE_TYPE):
         reader, last = CdrReader(data), _last

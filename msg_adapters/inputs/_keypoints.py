@@ -22,7 +22,6 @@ from msg_adapters.inputs._pose_array import MESSAGE_TYPE, read_poses
 from msg_adapters.markers import MARKER_ARRAY, Marker, decode_marker_array
 
 KEYPOINT_TYPES: dict[str, str] = {"keypoint_poses": MESSAGE_TYPE, "keypoint_markers": MARKER_ARRAY}
-"""Message type of each input type that holds keypoints."""
 
 _CUBE, _SPHERE, _ADD = 1, 2, 0
 _LISTS = (6, 7, 8)  # CUBE_LIST, SPHERE_LIST, POINTS

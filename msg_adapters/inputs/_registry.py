@@ -21,7 +21,6 @@ _CODECS: dict[str, ModuleType] = {
     "smpl_msgs": _smpl,
 }
 INPUT_TYPES: dict[str, str] = {name: codec.MESSAGE_TYPE for name, codec in _CODECS.items()}
-"""Message type of each input type."""
 SMPL_TOPIC = "smpl_params"
 """Name of the topic that a person's parameters are usually on, below the person's own name."""
 

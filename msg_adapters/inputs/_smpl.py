@@ -56,7 +56,6 @@ def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame
     layout = parse_layout(definition or message_definition(MESSAGE_TYPE).text)
 
     def from_bytes(data: Buffer) -> SmplFrame:
-        """The frame of a message in CDR."""
         with decoding(MESSAGE_TYPE):
             reader = CdrReader(data)
             stamp_ns, _ = reader.fields("Ts")

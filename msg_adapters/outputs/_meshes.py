@@ -133,7 +133,6 @@ def encode_scene(
 
 POLYGON = "geometry_msgs/msg/PolygonStamped"
 _COLOR, _WIDTH_M = (0.95, 0.55, 0.1, 1.0), 0.004
-"""Colour and width of the lines."""
 
 
 @dataclass(frozen=True, eq=False)

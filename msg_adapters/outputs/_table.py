@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from msg_adapters.diagnostics import DIAGNOSTIC_ARRAY, OK, DiagnosticStatus, encode_diagnostics
 from msg_adapters.markers import MARKER_ARRAY, SKIN, MarkerArrayEncoder, MarkerMesh, encode_delete, garment_namespace
-from msg_adapters.outputs._meshes import (
-    MESH,
-    POLYGON,
-    SCENE_UPDATE,
-    Entity,
-    Rim,
-    encode_frames,
-    encode_mesh,
-    encode_polygon,
-    encode_rims,
-    encode_scene,
-)
+from msg_adapters.outputs import _meshes
 from msg_adapters.outputs._points import POINT_CLOUD, POINT_FIELDS, PointCloudEncoder
 from msg_adapters.outputs._topics import Apart, Layouts, Moment, Obstacles, Output, Together
 from msg_adapters.transforms import TF_MESSAGE
@@ -42,10 +31,10 @@ def _mesh_of(one: DressedPerson, name: str) -> MarkerMesh:
     return MarkerMesh(ns, known.faces[name], known.counts[name], color=known.colors[name])
 
 
-def _rims_of(one: DressedPerson) -> list[Rim]:
+def _rims_of(one: DressedPerson) -> list[_meshes.Rim]:
     places = ((garment_namespace(name, one.person), rim) for name, rims in one.openings.items() for rim in rims)
     return [
-        Rim(f"{ns}/{rim.name}", one.stamp_ns, rim.centre + one.offset, rim.rotation, rim.ring + one.offset)
+        _meshes.Rim(f"{ns}/{rim.name}", one.stamp_ns, rim.centre + one.offset, rim.rotation, rim.ring + one.offset)
         for ns, rim in places
     ]
 
@@ -90,24 +79,24 @@ def _rim_names(one: DressedPerson) -> list[str]:
 
 def _encode_rims(worn: Sequence[DressedPerson], moment: Moment, _: Layouts) -> bytes:
     rims = [rim for one in worn for rim in _rims_of(one)]
-    return encode_rims(rims, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
+    return _meshes.encode_rims(rims, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
 
 
 def _encode_scene(worn: Sequence[DressedPerson], moment: Moment, layouts: Layouts) -> bytes:
     entities = [
-        Entity(layouts.get((one.person, name), partial(_mesh_of, one, name)), points, one.offset, one.stamp_ns)
+        _meshes.Entity(layouts.get((one.person, name), partial(_mesh_of, one, name)), points, one.offset, one.stamp_ns)
         for one in worn
         for name, points in one.vertices.items()
     ]
-    return encode_scene(entities, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
+    return _meshes.encode_scene(entities, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
 
 
 def _delete_entities(names: Sequence[str], moment: Moment) -> bytes:
-    return encode_scene([], deleted=names, stamp_ns=moment.now_ns, frame_id=moment.frame_id)
+    return _meshes.encode_scene([], deleted=names, stamp_ns=moment.now_ns, frame_id=moment.frame_id)
 
 
 def _encode_tf(worn: Sequence[DressedPerson], moment: Moment, _: Layouts) -> bytes:
-    return encode_frames([rim for one in worn for rim in _rims_of(one)], frame_id=moment.frame_id)
+    return _meshes.encode_frames([rim for one in worn for rim in _rims_of(one)], frame_id=moment.frame_id)
 
 
 def _encode_points(layouts: Layouts, one: DressedPerson, _: Any, moment: Moment) -> bytes:
@@ -145,7 +134,7 @@ def _opening_places(fittings: Fittings) -> Iterator[tuple[str, tuple[str, int]]]
 def _encode_polygon(one: DressedPerson, place: tuple[str, int], moment: Moment) -> bytes:
     name, i = place
     ring = one.openings[name][i].ring + one.offset
-    return encode_polygon(ring, stamp_ns=one.stamp_ns, frame_id=moment.frame_id)
+    return _meshes.encode_polygon(ring, stamp_ns=one.stamp_ns, frame_id=moment.frame_id)
 
 
 def _mesh_places(fittings: Fittings) -> list[tuple[str, str]]:
@@ -154,7 +143,7 @@ def _mesh_places(fittings: Fittings) -> list[tuple[str, str]]:
 
 def _encode_mesh(one: DressedPerson, name: str, moment: Moment) -> bytes:  # noqa: ARG001 - a mesh has no header
     vertices, faces = one.solid(name)
-    return encode_mesh(vertices + one.offset, faces)
+    return _meshes.encode_mesh(vertices + one.offset, faces)
 
 
 def make_outputs(*, tf: bool = False) -> list[Output]:
@@ -167,11 +156,11 @@ def make_outputs(*, tf: bool = False) -> list[Output]:
         Together(GARMENTS, MARKER_ARRAY, _garment_names, garments, _delete_markers),
         Together(BODY, MARKER_ARRAY, lambda one: [garment_namespace(BODY, one.person)], body, _delete_markers),
         Together(OPENINGS, MARKER_ARRAY, _rim_names, _encode_rims, _delete_markers),
-        Together("scene", SCENE_UPDATE, _garment_names, _encode_scene, _delete_entities),
+        Together("scene", _meshes.SCENE_UPDATE, _garment_names, _encode_scene, _delete_entities),
         Apart(POINT_CLOUD, lambda _: [("points", None)], partial(_encode_points, Layouts())),
         Apart(DIAGNOSTIC_ARRAY, lambda _: [("contacts", None)], _encode_contacts),
-        Apart(POLYGON, _opening_places, _encode_polygon),
-        Apart(MESH, _mesh_places, _encode_mesh, slow=True),
+        Apart(_meshes.POLYGON, _opening_places, _encode_polygon),
+        Apart(_meshes.MESH, _mesh_places, _encode_mesh, slow=True),
         Obstacles(),
     ]
     if tf:

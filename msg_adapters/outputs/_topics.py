@@ -25,7 +25,6 @@ class Moment(NamedTuple):
     """What an output needs to know besides the people."""
 
     frame_id: str
-    """Frame of every header."""
     lifetime_ns: int
     """Viewers forget what isn't renewed for so long [ns]; 0: never."""
     points_fields: Sequence[str]
@@ -33,7 +32,6 @@ class Moment(NamedTuple):
     planner_rate: float
     """Highest rate of meshes for planners; 0 for no limit [Hz]."""
     watchers: Callable[[str], int]
-    """How many listen to a topic."""
     now_ns: int
 
 

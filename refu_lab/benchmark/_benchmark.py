@@ -26,10 +26,10 @@ from refu_lab.benchmark._sdfs import moments, read_stretches
 from refu_lab.commands.benchmark import BenchmarkOptions
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.replay import replay
+from refu_lab.sources import open_source
 
 FIGURES = ("mpve_mm", "vfcp_percent", "cfmp_percent", "max_depth_mm")
 Key = tuple[str, str]
-"""Backbone and mode."""
 
 
 def benchmark(options: BenchmarkOptions, *, progress: bool = False) -> BenchmarkResult:
@@ -105,8 +105,11 @@ def accuracies(
     if not bag.is_dir():
         return {}
     options = ReplayOptions(input=bag, garments=(garment,), max_frames=frames)
-    found = {key: replay(options, pipeline=pipeline).after[garment].as_dict() for key, pipeline in pipelines.items()}
-    return {key: {name: float(one[name]) for name in FIGURES if one[name] is not None} for key, one in found.items()}
+    found = {}
+    for key, pipeline in pipelines.items():
+        figures = replay(options, source=open_source(options, pipeline)).after[garment].as_dict()
+        found[key] = {name: float(figures[name]) for name in FIGURES if figures[name] is not None}
+    return found
 
 
 def start_row(

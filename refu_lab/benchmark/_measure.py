@@ -120,8 +120,6 @@ def measure(
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkRow:
-    """How long one thing took."""
-
     stage: str
     """What was measured: `sdf`, `frame`, `frame.<stage>`, `persons`, `unchanged` or `start`."""
     mode: str
@@ -177,5 +175,4 @@ class BenchmarkResult:
         ]
 
     def as_dict(self) -> dict[str, Any]:
-        """The machine-readable result (`--json`)."""
         return vars(self) | {"rows": [row.as_dict() for row in self.rows]}

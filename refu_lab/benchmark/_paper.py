@@ -33,8 +33,6 @@ class PaperSettings:
 
 
 class _LowPrecision(WithoutWearerCode):
-    """A backbone in a precision of its own."""
-
     def __init__(self, backbone: Backbone, dtype: torch.dtype) -> None:
         self._backbone, self._dtype = backbone, dtype
 
@@ -46,7 +44,6 @@ class _LowPrecision(WithoutWearerCode):
         *,
         wearer_code: Tensor | None = None,  # noqa: ARG002
     ) -> Tensor | None:
-        """As `Backbone`."""
         style = None if style is None else style.to(self._dtype)
         return self._backbone(betas.to(self._dtype), pose.to(self._dtype), style)
 
@@ -84,7 +81,6 @@ class PaperStructure:
 
     @property
     def n_parameters(self) -> int:
-        """Number of weights."""
         networks = (*self._networks, self._distance, self._scale, self._k)
         return sum(p.numel() for network in networks for p in network.parameters())
 

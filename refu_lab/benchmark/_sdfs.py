@@ -61,8 +61,6 @@ Ask = Callable[[SdfFrame], Any]
 
 @dataclass(frozen=True, eq=False)
 class SdfMethod:
-    """One way to compute the distances."""
-
     name: str
     mode: str
     """The pipeline's mode that works this way, or `other`."""

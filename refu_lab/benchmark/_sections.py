@@ -57,7 +57,6 @@ class Section:
             return measure({PLAIN_QUERY: ask, **contenders}, windows or self.windows, **how)
 
     def add(self, stage: str, mode: str, timing: Timing, plain: Timing, **facts: Any) -> None:
-        """Adds a row."""
         device = torch.cuda.get_device_name() if self.device == "cuda" else self.device
         facts = {"garment": self.garment, "device": device, **facts}
         self.result.rows.append(BenchmarkRow.of(timing, plain, stage=stage, mode=mode, **facts))
@@ -69,7 +68,6 @@ class Section:
             self.add(f"frame.{stage}", mode, Timing(ms, ms), plain, **facts)
 
     def load_pipeline(self, mode: str, backbone: str, *, graph: bool = True) -> GarmentPipeline:
-        """Another pipeline of this garment."""
         return self.options.load_pipeline(self.garment, mode=mode, backbone=backbone, device=self.device, graph=graph)
 
 
@@ -85,7 +83,6 @@ class FrameRunner:
         """Time of each stage in each frame that wasn't a jump, by whichever clock `time.perf_counter` reads [ms]."""
 
     def __call__(self, moments: EncodedFrame | Sequence[EncodedFrame]) -> bytes:
-        """Returns the output message."""
         given = [moments] if isinstance(moments, EncodedFrame) else moments
         laps = [time.perf_counter()]
         frames = [self._decode(given[i].raw) for i in self._persons]

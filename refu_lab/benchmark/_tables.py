@@ -15,13 +15,11 @@ _MODES = ("hybrid", "accurate")
 
 
 def tables(result: BenchmarkResult) -> list[TextTable]:
-    """All tables that have rows."""
     made = (frames, stages, sdfs, persons, unchanged, paper, starts)
     return [table for table in (make(result) for make in made) if table.rows]
 
 
 def frames(result: BenchmarkResult) -> TextTable:
-    """Run time and error of every mode."""
     rows: list[tuple[str, ...]] = []
     for row in result.of("frame"):
         if row.mode != "paper":
@@ -37,7 +35,6 @@ def frames(result: BenchmarkResult) -> TextTable:
 
 
 def stages(result: BenchmarkResult) -> TextTable:
-    """Where the time goes."""
     main = result.rows[0].garment
     found = {
         (row.stage, row.mode): f"{row.ms_median:.2f}"
@@ -50,21 +47,18 @@ def stages(result: BenchmarkResult) -> TextTable:
 
 
 def sdfs(result: BenchmarkResult) -> TextTable:
-    """Run time of every signed distance."""
     rows = [_line(row, f"{row.garment}: {row.method}") for row in result.of("sdf")]
     note = "Of all vertices of a body's new pose, preparation included. The plain query is the unit of all ratios."
     return TextTable("Every signed distance, of the same vertices", ("signed distance", *_TIMES), rows, note)
 
 
 def persons(result: BenchmarkResult) -> TextTable:
-    """How run time grows with the number of persons."""
     ratio = "ratio_to_one_person"
     rows = [_line(row, f"{row.mode}, {row.persons}", _figure(row, ratio, 2)) for row in result.of("persons")]
     return TextTable("Persons", ("mode, persons", *_TIMES, "to one person"), rows)
 
 
 def unchanged(result: BenchmarkResult) -> TextTable:
-    """Run time when the pose doesn't change."""
     keys = ("share_of_frame", "share_of_pipeline")
     shares = [(row, [f"{100 * row.figures[key]:.1f}" for key in keys]) for row in result.of("unchanged")]
     rows = [_line(row, row.mode, *of_row) for row, of_row in shares]
@@ -74,7 +68,6 @@ def unchanged(result: BenchmarkResult) -> TextTable:
 
 
 def paper(result: BenchmarkResult) -> TextTable:
-    """The paper's structure on the same core, and the paper's own figures."""
     rows: list[tuple[str, ...]] = []
     for row in result.of("frame", mode="paper"):
         times = (_figure(row, "times_hybrid", 0), _figure(row, "times_accurate", 0))
@@ -94,7 +87,6 @@ def paper(result: BenchmarkResult) -> TextTable:
 
 
 def starts(result: BenchmarkResult) -> TextTable:
-    """Load time and memory."""
     rows = []
     for row in result.of("start"):
         sizes = [value for key, value in row.figures.items() if key.startswith("weights_mb_")]
@@ -168,7 +160,6 @@ def conditions(result: BenchmarkResult) -> str:
 
 
 def benchmark_text(result: BenchmarkResult) -> str:
-    """What `refu benchmark` prints."""
     parts = [conditions(result)]
     parts += [table.text() for table in tables(result)]
     parts += [f"not measured: {name}: {need}" for name, need in result.missing.items()]

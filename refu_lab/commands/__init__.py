@@ -6,4 +6,3 @@ What a command needs is imported when it runs, so that `refu --help` doesn't wai
 from refu_lab.commands import benchmark, evaluate, export, garment, info, replay, simulate, stress, train, view
 
 COMMANDS = (replay, view, garment, export, simulate, train, evaluate, benchmark, stress, info)
-"""The commands in the order of the help."""

@@ -39,7 +39,6 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-[\d.]")  # argparse's own takes -1,0 for an option
 
     def error(self, message: str) -> NoReturn:
-        """Prints the error and ends the program."""
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
 
 
@@ -73,8 +72,7 @@ def numbers(count: int, *, least: int = 1) -> Callable[[str], tuple[float, ...]]
             found = ()
         if not least <= len(found) <= count or not all(map(math.isfinite, found)):
             most = f"up to {count}" if least < count else count
-            msg = f"wanted {most} finite numbers with commas between them, got {text!r}"
-            raise argparse.ArgumentTypeError(msg)
+            raise argparse.ArgumentTypeError(f"wanted {most} finite numbers with commas between them, got {text!r}")
         return found + (0.0,) * (count - len(found))
 
     return parse
@@ -95,15 +93,11 @@ def _number(kind: type[Number], text: str, *, low: float, high: float) -> Number
 
 
 positive = partial(_number, int, low=1, high=_MOST)
-"""A whole number above zero."""
 seed = partial(_number, int, low=0, high=_MOST)
-"""A whole number that can be a random seed."""
 port = partial(_number, int, low=1, high=65_535)
-"""A port number."""
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
-    """A parser of a number from `low` to `high`."""
     return partial(_number, float, low=low, high=high)
 
 

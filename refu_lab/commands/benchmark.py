@@ -53,8 +53,6 @@ MAIN_GARMENT = "tshirt-male"
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions:
-    """What to measure and how."""
-
     garments: tuple[str, ...] | None = setting(
         None, "garments to wear, the main one first (default: all)", parse=cli.names, metavar="A,B"
     )
@@ -103,7 +101,6 @@ class BenchmarkOptions:
 
     @property
     def sizes(self) -> BenchmarkSizes:
-        """How much is measured."""
         return _QUICK if self.quick else BenchmarkSizes(rounds=self.rounds)
 
     def on_body(self, garment: str, *, device: str = "cpu") -> tuple[GarmentTemplate, SmplBody]:

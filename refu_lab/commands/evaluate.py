@@ -14,8 +14,6 @@ from refu_lab.tables import RESULT_TABLES
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """What to evaluate."""
-
     data: tuple[Path, ...] = ()
     table: str = setting("all", "one table, or all", choices=(*RESULT_TABLES, "all"))
     weights: tuple[Path, ...] = ()

@@ -14,8 +14,6 @@ from refu_lab.commands import _common as cli
 
 @dataclass(frozen=True, kw_only=True)
 class AddOptions:
-    """Which mesh to make a garment from, and how."""
-
     mesh: Path
     body: str = setting("neutral", "male, female or neutral")
     name: str | None = setting(None, "its name (default: that of the mesh's file)")

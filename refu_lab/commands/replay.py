@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -42,13 +42,14 @@ class RecordingOptions(DressOptions):
 
     def load_pipeline(self) -> GarmentPipeline:
         """The pipeline that these options ask for. Raises `RefuError` for invalid options."""
-        return self.load(margin=self.margin, style=self.style if any(self.style) else None)
+        from refu_core._device import one_thread
+
+        with one_thread():
+            return self.load(margin=self.margin, style=self.style if any(self.style) else None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions(RecordingOptions):
-    """What to replay and how."""
-
     output: Path | None = None
     speed: Literal["max", "real"] = setting("max", "as fast as possible, or paced (real)", choices=("max", "real"))
     frame_id: str = setting(
@@ -58,7 +59,11 @@ class ReplayOptions(RecordingOptions):
     overwrite: bool = setting(False, "replace an existing output")
     evaluate: bool = setting(True, "check every frame for collisions; if not, only its latency is kept")
     with_body: bool = True
-    """Whether the output also has the body."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.output is not None:
+            cli.require_apart(self.input, self.output)
 
 
 def add(commands: Any) -> None:
@@ -130,22 +135,12 @@ def _replay_one(args: argparse.Namespace) -> int:
     report = None if args.report is None else Path(args.report)
     output = None if args.output is None else Path(args.output)
     options = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(args.input[0]), "output": output})
-    if output is not None:
-        cli.require_apart(options.input, output)
-
-    @cache
-    def load() -> GarmentPipeline:
-        from refu_core._device import one_thread
-
-        with one_thread():
-            return options.load_pipeline()
-
-    source = open_source(options, lambda: load().body)  # a bad bag is reported before torch is imported
+    source = open_source(options)  # a bad bag is reported before torch is imported
 
     from refu_lab.replay import replay
 
     told = partial(print, "progress", flush=True) if args.progress == "lines" else None
-    result = replay(options, pipeline=load(), source=source, progress=not args.quiet, told=told)
+    result = replay(options, source=source, progress=not args.quiet, told=told)
     cli.tell(args, replay_table(result), result.as_dict())
     if report is not None and result.frames:
         from refu_lab.report import write_report

@@ -15,8 +15,6 @@ from refu_lab.commands import _common as cli
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """What to simulate."""
-
     garments: list[str]
     count: int
     output: Path

@@ -20,8 +20,6 @@ MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "ac
 
 @dataclass(frozen=True, kw_only=True)
 class StressOptions:
-    """What to try."""
-
     parts: tuple[str, ...] = setting(PARTS, "what is tried", metavar="A,B")
     garments: tuple[str, ...] = setting(PAPER_GARMENTS, "garments of any body", metavar="A,B")
     backbone: str | None = setting(None, f"one mode (default: {', '.join(map(' '.join, MODES))})", metavar="NAME")
@@ -55,12 +53,10 @@ class StressOptions:
 
     @property
     def n_rounds(self) -> int:
-        """How often each check is run, at least."""
         return self.rounds or (1 if self.quick or self.hours is not None else 3)
 
     @property
     def n_frames(self) -> int:
-        """Frames of each soak, at most."""
         return self.frames or (10_000_000 if self.hours is not None else 200 if self.quick else 3_000)
 
 

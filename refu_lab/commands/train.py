@@ -17,8 +17,6 @@ TRAIN_MODES = ("none", "hybrid", "approx", "accurate", "collision-approx", "coll
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What to train, and on what."""
-
     garment: str
     data: Path
     network: str = setting(

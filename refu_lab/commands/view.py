@@ -14,8 +14,6 @@ from refu_lab.commands.replay import RecordingOptions
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """What is shown, and where."""
-
     inputs: tuple[Path, ...] = ()
     live: tuple[str, ...] | None = None
     """Marker topics to show in place of inputs; if empty, the node's own; None shows the inputs."""

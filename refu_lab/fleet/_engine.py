@@ -14,7 +14,6 @@ import os
 import pickle
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -25,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from refu_core import RefuError, __version__
 from refu_core._engine import Engine, InProcess, Lost, Result, Task
+from refu_lab.interrupts import interruptible
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -68,7 +68,7 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
     # Errors are reported in one line by the command; Dask would log a traceback for a scheduler that is gone.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    with dask.config.set(settings), ExitStack() as stack:
+    with dask.config.set(settings), interruptible(), ExitStack() as stack:
         cluster: Any = stack.enter_context(_own_cluster(jobs)) if scheduler is None else scheduler
         try:
             client = Client(cluster, timeout=CONNECT_S, set_as_default=False)
@@ -118,31 +118,9 @@ def _ctrl_c_waits() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-@contextmanager
-def _ctrl_c_comes_later() -> Iterator[None]:
-    """Holds an interrupt back until the end of the block: raised in a destructor, it would be lost.
-
-    `_ctrl_c_waits` doesn't hold it back once there are threads that take signals, of libraries for instance.
-    """
-    if threading.current_thread() is not threading.main_thread():  # which alone is interrupted
-        yield
-        return
-    came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if came:
-        signal.raise_signal(signal.SIGINT)
-
-
 class DaskEngine:
-    """Runs tasks on a client's workers."""
-
     def __init__(self, client: Client) -> None:
         self.client = client
-        """The client whose workers run the tasks."""
 
     def run(
         self, make: Callable[[], Callable[[Task], Result]], tasks: Sequence[Task]
@@ -171,13 +149,12 @@ class DaskEngine:
         while numbers:
             future = next(done)
             result = self._result(future)
-            with _ctrl_c_comes_later():
-                index = numbers.pop(future)
-                future.release()
-                del future
-                following = next(waiting, None)
-                if following is not None:
-                    done.add(submit(following))
+            index = numbers.pop(future)
+            future.release()
+            del future
+            following = next(waiting, None)
+            if following is not None:
+                done.add(submit(following))
             yield index, result
 
     def _result(self, future: Future[Any]) -> Any:

@@ -18,7 +18,6 @@ from refu_core.recordings import SUFFIXES as MOTION_SUFFIXES
 from refu_lab.fleet._storage import filesystem, is_url
 
 SUFFIXES = (*BAG_SUFFIXES, *MOTION_SUFFIXES)
-"""Suffixes of the recordings that a folder is searched for."""
 _METADATA = "metadata.yaml"
 _MAGIC = re.compile(r"[*?\[]")
 _SPLIT = re.compile(r"(.+)_\d+")

@@ -67,7 +67,6 @@ class Folder:
     place: str
 
     def at(self, name: str) -> str:
-        """Path or URL of something in it."""
         return f"{self.place.rstrip('/')}/{name}"
 
     @contextmanager
@@ -102,7 +101,6 @@ class Folder:
             path.replace(place)
 
     def put_text(self, text: str, name: str) -> None:
-        """Writes a text file."""
         with self.scratch() as folder:
             file = folder / "text"
             file.write_text(text, encoding="utf-8")

@@ -32,7 +32,6 @@ class FleetResult:
 
     @property
     def failed(self) -> list[dict[str, Any]]:
-        """Recordings that couldn't be replayed."""
         return [row for row in self.rows if "error" in row]
 
     def worst(self) -> list[dict[str, Any]]:
@@ -61,7 +60,6 @@ class FleetResult:
         return {name: _merged(of_name) for name, of_name in parts.items()}
 
     def as_dict(self) -> dict[str, Any]:
-        """The machine-readable result (`--json`)."""
         return {
             "recordings": len(self.rows) + self.n_left,
             "failed": len(self.failed),
@@ -98,7 +96,6 @@ class FleetResult:
 
 
 def fleet_table(result: FleetResult) -> str:
-    """What `refu replay` prints for several recordings."""
     lines = [format_table(_HEADER, [_cells(row) for row in result.rows])] if result.rows else []
     if garments := result.garments():
         header, rows = replay_columns(garments)

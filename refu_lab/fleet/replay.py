@@ -24,6 +24,7 @@ from refu_lab.fleet._inputs import Input
 from refu_lab.fleet._storage import Folder, fetched, filesystem, is_url
 from refu_lab.fleet._summary import FleetResult
 from refu_lab.replay import ReplayResult, replay
+from refu_lab.sources import open_source
 
 WORST = 5
 """Number of a recording's worst frames that are listed in its record."""
@@ -151,7 +152,8 @@ def _make(options: FleetOptions, recording: Input, path: Path) -> dict[str, Any]
     output = None if options.output is None else Folder(options.output)
     with nullcontext() if output is None else output.scratch() as own:
         bag = None if own is None else own / f"{Path(name).name}.mcap"  # a bag contains its own name
-        result = replay(replace(options.replay, input=path, output=bag), pipeline=pipeline_for(options.replay))
+        asked = replace(options.replay, input=path, output=bag)
+        result = replay(asked, source=open_source(asked, pipeline_for(options.replay)))
         if result.interrupted:  # a record is of a whole recording
             raise KeyboardInterrupt
         if output is not None and bag is not None:

@@ -25,12 +25,9 @@ _MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
 
 @dataclass(frozen=True)
 class SampleTable:
-    """A table over test samples."""
-
     title: str
     about: str
     methods: tuple[str, ...]
-    """Methods in the order of the rows."""
     metrics: tuple[str, ...] = _MAIN
     """Metrics that a method without a run has, too, as None."""
     values: Callable[[MethodRun], Values] | None = None
@@ -39,7 +36,6 @@ class SampleTable:
     """Whether there are rows over all garments together."""
 
     def of(self, run: MethodRun | None) -> Values:
-        """The figures of one method's run on one garment's samples."""
         if run is None:
             return dict.fromkeys(self.metrics)
         return self.values(run) if self.values else {metric: getattr(run.figures, metric) for metric in self.metrics}
@@ -187,7 +183,6 @@ def unseen_groups(run: MethodRun) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 POSTURE_METHODS = ("tailornet", "node-hybrid")
-"""Methods that the table of postures needs."""
 _SDFS = ("approx", "accurate")
 _MODES = (*_SDFS, "hybrid")
 _OPTIMISATIONS = (
@@ -310,4 +305,3 @@ _COMPONENTS: Mapping[str, tuple[str, ...]] = {
 }
 """For each component its label, the method that has it, and the parts of that method's time."""
 TIMED_METHODS = tuple(dict.fromkeys(method for _, method, *_ in _COMPONENTS.values()))
-"""Methods that the table of times needs."""

@@ -13,14 +13,7 @@ from refu_core import RefuError
 from refu_core._device import one_thread
 from refu_core._engine import Engine
 from refu_lab.commands.evaluate import EvaluateOptions
-from refu_lab.reproduction._build import (
-    POSTURE_METHODS,
-    SAMPLE_TABLES,
-    TIMED_METHODS,
-    posture_table,
-    sample_table,
-    time_table,
-)
+from refu_lab.reproduction import _build
 from refu_lab.reproduction._methods import SEQUENCE_SHAPES, Library
 from refu_lab.reproduction._motion import motion_table
 from refu_lab.reproduction._plots import PLOTS, picture_garments
@@ -77,9 +70,9 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     output, n_posed = options.output, {samples.garment: len(samples) for samples in posed}
     output.mkdir(parents=True, exist_ok=True)
     study, tables = Study(), []
-    of_study = [name for name in wanted if name in SAMPLE_TABLES and name != "sequence"]
-    methods = list(dict.fromkeys(method for name in of_study for method in SAMPLE_TABLES[name].methods))
-    methods += [name for name in POSTURE_METHODS if "postures" in wanted and name not in methods]
+    of_study = [name for name in wanted if name in _build.SAMPLE_TABLES and name != "sequence"]
+    methods = list(dict.fromkeys(method for name in of_study for method in _build.SAMPLE_TABLES[name].methods))
+    methods += [name for name in _build.POSTURE_METHODS if "postures" in wanted and name not in methods]
     for samples in posed if methods else ():
         run_methods(study, samples, methods, engine=engine, **how)
     for name in wanted:
@@ -89,23 +82,23 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
             for samples in moving:
                 own = [f"mlp-{samples.shapes}{refu}" for refu in ("", "-refu-approx")]
                 run_methods(in_motion, samples, own, engine=engine, **how)
-            table = sample_table(in_motion, name)
+            table = _build.sample_table(in_motion, name)
             n_samples = {f"{samples.garment}, {samples.shapes} shapes": len(samples) for samples in moving}
         elif name == "motion":
             table = motion_table(read_clips(options.motions or Path()), every=options.motion_every, **how)
             n_samples = {}
         elif name == "postures":
-            table = posture_table(study)
+            table = _build.posture_table(study)
         elif name == "sdf":
             table = sdf_table(posed, **how)
         elif name == "time":  # in a run of its own
             timed = Study()
             with one_thread():
                 for samples in posed:
-                    run_methods(timed, samples.thinned(_TIMED), TIMED_METHODS, **how)
-            table, n_samples = time_table(timed), timed.n_samples
+                    run_methods(timed, samples.thinned(_TIMED), _build.TIMED_METHODS, **how)
+            table, n_samples = _build.time_table(timed), timed.n_samples
         else:
-            table = sample_table(study, name)
+            table = _build.sample_table(study, name)
             table.plots += PLOTS[name](study, output) if name in PLOTS else []
             if name == "comparison":
                 table.plots += picture_garments(study, posed, output, library=library)
@@ -126,7 +119,6 @@ def results_text(tables: Sequence[ResultTable], output: Path) -> str:
 
 
 def results_dict(tables: Sequence[ResultTable]) -> dict[str, Any]:
-    """The machine-readable result (`--json`)."""
     return {
         "rows": [row._asdict() for table in tables for row in table.rows],
         "missing": [{"table": table.name, **asdict(missing)} for table in tables for missing in table.missing],

@@ -138,7 +138,6 @@ def _ablated(whole: Method, bare: str, folder: str) -> Iterator[Method]:
 
 
 METHODS: Mapping[str, Method] = {method.name: method for method in _methods()}
-"""All methods by name."""
 
 
 class Library:

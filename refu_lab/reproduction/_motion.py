@@ -13,25 +13,16 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from msg_adapters import Motion
+from refu_core import metrics
 from refu_core.errors import RefuError
 from refu_core.frames import LAGS, N_BETAS, SmplFrame
 from refu_core.history import PoseHistory
-from refu_core.metrics import (
-    CollisionChecker,
-    Figures,
-    FrameMetrics,
-    GarmentMetrics,
-    SelfContact,
-    SelfContactDetector,
-    SheetChecker,
-)
 from refu_core.modes import DEFAULT_GARMENTS
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._tables import Missing, ResultTable
 
 OUTFITS = (DEFAULT_GARMENTS, ("shirt-male",), ("skirt-female",))
-"""Garments that are worn together."""
 MOTION_METHODS = ("node-hybrid", "node-accurate")
 """Methods that are shown for every clip, in the order of the rows."""
 NEAR = 0.02
@@ -137,7 +128,7 @@ class SkinShifts:
 class Judged:
     """Figures of one garment in one frame, as one method makes it."""
 
-    on_collider: FrameMetrics
+    on_collider: metrics.FrameMetrics
     is_free_of_skin: bool
     is_collider_cut: bool
     jump_mm: float
@@ -151,7 +142,7 @@ class Judged:
 
 def figures_of(judged: Sequence[Judged]) -> dict[str, float | None]:
     """The figures of a garment over some frames, by metric; `layers_cut_percent` is None for one worn alone."""
-    figures = Figures.over([one.on_collider for one in judged])
+    figures = metrics.Figures.over([one.on_collider for one in judged])
     jumps = np.array([one.jump_mm for one in judged])
     layers = [one.is_layer_cut for one in judged if one.is_layer_cut is not None]
     return {
@@ -179,17 +170,17 @@ class OutfitJudge:
             garments, body=next(iter(pipelines.values())).body, backbone="skinned", sdf="none", collider=False
         )
         self.body = self._skinned.body
-        self._collider, self._skin = CollisionChecker(self.body.faces), CollisionChecker(self.body.faces)
+        self._collider, self._skin = (metrics.CollisionChecker(self.body.faces) for _ in range(2))
         self._detector = lru_cache(maxsize=8)(self._make_detector)
         templates = self._skinned.garments
-        self._metrics = {name: GarmentMetrics(one.faces.numpy()) for name, one in templates.items()}
-        self._sheets = {name: SheetChecker(one.faces.numpy()) for name, one in templates.items()}
+        self._metrics = {name: metrics.GarmentMetrics(one.faces.numpy()) for name, one in templates.items()}
+        self._sheets = {name: metrics.SheetChecker(one.faces.numpy()) for name, one in templates.items()}
         self._lengths = lru_cache(maxsize=64)(self._rest_lengths)
 
-    def _make_detector(self, betas: bytes) -> SelfContactDetector:
+    def _make_detector(self, betas: bytes) -> metrics.SelfContactDetector:
         """A detector for one shape: which faces cross at rest already (toes) depends on it."""
         shape = torch.from_numpy(np.frombuffer(betas, np.float32).copy())[None]
-        return SelfContactDetector(self.body.faces, self.body.rest_vertices(shape)[0])
+        return metrics.SelfContactDetector(self.body.faces, self.body.rest_vertices(shape)[0])
 
     def _rest_lengths(self, garment: str, betas: bytes) -> NDArray[np.floating]:
         template = self._skinned.garments[garment]
@@ -205,7 +196,7 @@ class OutfitJudge:
     def judge(self, frames: Sequence[SmplFrame]) -> tuple[dict[tuple[str, str], Judged], NDArray[np.floating]]:
         """Judges the first of two frames, by (garment, method); and how far its skin was moved [m], shape (V,)."""
         skinned = self._skinned(frames)
-        contact: SelfContact | None = None
+        contact: metrics.SelfContact | None = None
         judged: dict[tuple[str, str], Judged] = {}
         for method, pipeline in self._pipelines.items():
             now, then = pipeline(frames)
@@ -224,7 +215,7 @@ class OutfitJudge:
         garment: str,
         out: PipelineOutput,
         frame: SmplFrame,
-        contact: SelfContact,
+        contact: metrics.SelfContact,
         way: NDArray[np.floating],
         way_of_skinned: NDArray[np.floating],
     ) -> Judged:

@@ -87,11 +87,9 @@ def plot_unseen(study: Study, folder: Path) -> list[tuple[str, str]]:
 
 
 PLOTS = {"energy": plot_energy, "alpha": plot_scale, "unseen": plot_unseen}
-"""The functions that draw the plots of each table."""
 
 
 def _shown(study: Study, methods: tuple[str, ...]) -> dict[str, MethodRun]:
-    """The runs of those of the methods that were run on all garments, by label."""
     return {METHODS[name].label: run for name in methods if (run := study.pooled(name)).samples}
 
 

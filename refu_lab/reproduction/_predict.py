@@ -68,8 +68,6 @@ class SampleScene:
 
 
 class MethodOutput(NamedTuple):
-    """What a method made of a scene."""
-
     vertices: Tensor
     """Garment [m], shape (N, 3)."""
     ms: Mapping[str, float]
@@ -83,8 +81,6 @@ class MethodOutput(NamedTuple):
 
 
 class Predictor:
-    """One method for one garment."""
-
     def __init__(self, method: Method, setup: GarmentSetup, library: Library) -> None:
         """Loads what the method needs. Raises `WeightsError` for networks that aren't trained."""
         self._method = method
@@ -105,7 +101,6 @@ class Predictor:
 
     @torch.no_grad()
     def __call__(self, scene: SampleScene) -> MethodOutput:
-        """The garment in a scene."""
         if self._pipeline is not None:
             return self._of_node(self._pipeline, scene)
         ended: dict[str, float] = {}

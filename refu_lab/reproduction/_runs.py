@@ -159,7 +159,6 @@ class MethodRun:
 
     @cached_property
     def figures(self) -> Figures:
-        """The figures over all samples."""
         return Figures.over([sample.figures for sample in self.samples])
 
     @cached_property
@@ -178,7 +177,6 @@ class MethodRun:
         return float(np.median([sum(sample.ms[component] for component in components) for sample in self.samples]))
 
     def of_postures(self, postures: Sequence[str]) -> list[FrameMetrics]:
-        """The figures of the samples in these postures."""
         return [sample.figures for sample in self.samples if sample.posture in postures]
 
 
@@ -198,7 +196,6 @@ class Study:
     """By (garment, method)."""
     missing: dict[tuple[str, str], Missing] = field(default_factory=dict)
     n_samples: dict[str, int] = field(default_factory=dict)
-    """Test samples by garment."""
 
     def pooled(self, method: str) -> MethodRun:
         """The method on all garments; without samples if one is missing, as means would then be over other garments."""

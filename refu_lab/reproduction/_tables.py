@@ -62,8 +62,6 @@ def published_modes() -> dict[str, dict[str, float]]:
 
 
 class Metric(NamedTuple):
-    """How a metric is written."""
-
     label: str
     digits: int
     higher_is_better: bool = False
@@ -132,7 +130,6 @@ class Missing:
     method: str
     reason: str
     command: str
-    """The command that makes what is missing."""
 
 
 @dataclass(eq=False)
@@ -157,11 +154,9 @@ class ResultTable:
             self.rows.append(ResultRow(self.name, garment, method, metric, value, paper))
 
     def value(self, garment: str, method: str, metric: str) -> float | None:
-        """The measured figure; None if there is none."""
         return next((row.value for row in self.rows if row[1:4] == (garment, method, metric)), None)
 
     def label(self, method: str) -> str:
-        """A row's readable name."""
         return self.labels.get(method) or (METHODS[method].label if method in METHODS else method)
 
     def markdown(self, *, source: str) -> list[str]:
@@ -300,7 +295,6 @@ def _metric(name: str) -> Metric:
 
 
 def _text(metric: str, value: float | None) -> str:
-    """A figure as text; a dash if there is none."""
     signed = "+" if metric.endswith("_trend") else ""
     return "–" if value is None else f"{value:{signed}.{_metric(metric).digits}f}"
 

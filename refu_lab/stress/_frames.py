@@ -103,7 +103,6 @@ def _self_penetrating(rng: np.random.Generator) -> SmplFrame:
 
 
 def _anything(rng: np.random.Generator) -> SmplFrame:
-    """Any rotation of any joint."""
     return frame_of(Rotation.random(N_JOINTS, random_state=rng).as_rotvec(), betas=rng.normal(0, 2, N_BETAS))
 
 
@@ -157,7 +156,6 @@ FRAMES: Mapping[str, Draw] = {
     "limbs through the trunk": _self_penetrating,
     "absurd": _absurd,
 }
-"""Kinds of frames, by name."""
 
 
 def between(poses: Sequence[NDArray[np.floating]], steps: int) -> list[NDArray[np.float64]]:

@@ -52,7 +52,6 @@ def against_float64(subject: Subject, trial: Trial, *, on_collider: bool = False
 
 
 def n_not_finite(*arrays: NDArray[np.floating]) -> int:
-    """How many numbers in the arrays are NaN or infinite."""
     return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
 
 
@@ -126,7 +125,6 @@ POINTS: dict[str, Place] = {
     "far away": _far,
     "faces without area": _without_area,
 }
-"""Kinds of query points, by name."""
 
 
 def distances(place: Place) -> Callable[[Subject, Trial], Iterator[Measurement]]:

@@ -46,7 +46,6 @@ DrawTrial = Callable[[np.random.Generator], Trial]
 _FRAMES = 64
 """Frames in a trial of numbers, and persons in a batch."""
 _STEPS = 24
-"""Frames of a motion."""
 
 
 def _many(draw: Draw) -> DrawTrial:
@@ -157,19 +156,15 @@ CHECKS: dict[str, Check] = {
 
 
 _SOAK_SHARE = 0.3
-"""Share of a long run's time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StressResult:
-    """The results of all checks and soaks."""
-
     tallies: list[Tally] = field(default_factory=list)
     soaks: list[SoakResult] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     """What could not be tried, and why."""
     files: list[Path] = field(default_factory=list)
-    """Files of the worst cases."""
 
     @property
     def failures(self) -> int:
@@ -177,7 +172,6 @@ class StressResult:
         return sum(one.failures for one in self.tallies) + sum(one.failures for one in self.soaks)
 
     def as_dict(self) -> dict[str, Any]:
-        """The results, ready for JSON."""
         rows = [one.as_dict() for one in self.tallies] + [one.as_dict() for one in self.soaks]
         return {"rows": rows, "left_out": self.left_out, "failures": self.failures}
 

@@ -59,7 +59,6 @@ class SoakResult:
         return (self.growth("mb") > TOLERANCE) + slower + (self.nan > 0)
 
     def as_dict(self) -> dict[str, Any]:
-        """A row of the results, ready for JSON."""
         row: dict[str, Any] = {"case": "soak: pipeline", "runs": self.frames, "max_deviation_m": 0.0}
         row |= {name: getattr(self, name) for name in ("mode", "persons", "nan", "seconds", "failures")}
         row |= {f"tenths_{name}": values for name, values in self.tenths.items()}

@@ -33,7 +33,6 @@ class Wardrobe:
 
     @property
     def mode(self) -> str:
-        """`<backbone>/<sdf>`."""
         return f"{self.backbone}/{self.sdf}"
 
 
@@ -170,7 +169,6 @@ class Measurement:
     """What one trial, or a part of it, showed."""
 
     runs: int = 1
-    """Frames tried."""
     refused: int = 0
     """How many of them were refused with an error that says why."""
     nan: int = 0
@@ -180,7 +178,6 @@ class Measurement:
     limit: float = math.inf
     """The largest acceptable deviation [m], above zero."""
     faults: tuple[str, ...] = ()
-    """What else went wrong."""
     culprit: int | None = None
     """Index of the frame that showed this, if that frame alone reproduces it."""
 
@@ -193,7 +190,6 @@ class Measurement:
 
     @property
     def is_failure(self) -> bool:
-        """Whether anything is wrong."""
         return self.badness > 1
 
 
@@ -219,7 +215,6 @@ class Check:
         return self.name.partition(":")[0]
 
     def holds_for(self, wardrobe: Wardrobe) -> bool:
-        """Whether the wardrobe's mode promises it."""
         return not self.needs_sdf or wardrobe.sdf != "none"
 
     def run(self, subject: Subject, trial: Trial) -> Measurement:
@@ -257,12 +252,10 @@ class Tally:
     faults: list[str] = field(default_factory=list)
     """The first few."""
     worst: Measurement | None = None
-    """What the worst trial showed."""
     worst_trial: tuple[Wardrobe, Trial] | None = None
     """The worst trial, and what was worn in it."""
 
     def add(self, wardrobe: Wardrobe, trial: Trial, measured: Measurement) -> None:
-        """Counts a trial."""
         self.runs += measured.runs
         self.refused += measured.refused
         self.failures += measured.is_failure

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +22,16 @@ from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.commands.replay import RecordingOptions
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
-from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
+from refu_lab.view._film import BODY, SKIN, SceneMesh
 
+_CACHE_BYTES = 512 << 20
+"""Of frames that are kept, once dressed."""
 _AWAY_S = 0.25
 """A person whose nearest frame is farther off in time isn't shown [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PersonMotion:
-    """One person's motion."""
-
     person: str
     frames: list[SmplFrame]
     times: NDArray[np.float64]
@@ -57,21 +58,16 @@ class DressedFilm:
         self._given = dict(zip(self.garments, options.garments, strict=True))
         """What each garment was asked for by: some are files."""
         self.notes: list[str] = []
-        """Warnings for the user."""
         names = _different([path.stem for path in inputs]) if len(inputs) > 1 else [""]
         self._tracks = [track for path, name in zip(inputs, names, strict=True) for track in self._read(path, name)]
         longest = max(self._tracks, key=lambda track: len(track.frames))
         self._moments = longest.times
+        self.times = self._moments - self._moments[0]
+        """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
         first = self._tracks[0]
         self._origin = first.turn @ first.frames[0].transl
         self._begin()
         self.title = ", ".join(path.name for path in inputs)
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Times of the frames of the person who has the most, from the first one on [s], shape (T,)."""
-        times: NDArray[np.float64] = self._moments - self._moments[0]
-        return times
 
     @property
     def front(self) -> float:
@@ -82,12 +78,10 @@ class DressedFilm:
 
     @property
     def garments(self) -> tuple[str, ...]:
-        """Names of the garments worn."""
         return tuple(self._pipeline.garments)
 
     @property
     def sdf(self) -> str:
-        """The signed distance that finds collisions."""
         return str(self._options.sdf)
 
     @property
@@ -109,7 +103,8 @@ class DressedFilm:
         self._body_faces = self._pipeline.body.faces.cpu().numpy()  # one array: drawing compares identities
         n_vertices = 2 * self._pipeline.body.n_vertices
         n_vertices += sum(one.n_vertices for one in self._pipeline.garments.values())
-        self._dressed = remembering(self._dress, frame_bytes=12 * n_vertices * len(self._tracks))
+        frame_bytes = 12 * n_vertices * len(self._tracks)
+        self._dressed = lru_cache(max(1, _CACHE_BYTES // frame_bytes))(self._dress)
 
     def shapes(self, index: int) -> Sequence[SceneMesh]:
         """All persons in a frame, dressed. Raises `RefuError`."""
@@ -157,14 +152,14 @@ class DressedFilm:
 
     def _frames(self, options: RecordingOptions) -> list[SmplFrame]:
         """At least one frame, in the order of their stamps."""
-        source = open_source(options, lambda: self._pipeline.body)
+        source = open_source(options, self._pipeline)
         source.history = PoseHistory()  # garments that are put on later may heed it
         records, frames = list(source.records), []
         for record in records:
             with suppress(RefuError):
                 frames.append(source.frame_of(record))
         n_bad = len(records) - len(frames)
-        self.notes += source.warnings(self._pipeline)
+        self.notes += source.warnings()
         if n_bad:
             self.notes.append(f"{options.input}: {n_bad} messages are no frame and are left out")
         if not frames:

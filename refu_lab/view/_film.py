@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 BODY, SKIN = "body", "skin"
 """Names of shapes that aren't garments: the collider, and the posed body as it is."""
-_CACHE_BYTES = 512 << 20
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +28,4 @@ class SceneMesh:
 
     @property
     def is_garment(self) -> bool:
-        """Whether it is a garment."""
         return self.name not in (BODY, SKIN)
-
-
-def remembering(make: Callable[[int], Made], *, frame_bytes: int) -> Callable[[int], Made]:
-    """`make`, which keeps what it made of the frames used last: half a gigabyte of frames of such a size."""
-    return lru_cache(max(1, _CACHE_BYTES // max(1, frame_bytes)))(make)

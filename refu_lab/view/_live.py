@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 import msg_adapters as adapters
 from refu_core import RefuError
@@ -32,7 +31,7 @@ class LiveFilm:
 
         self.title = f"live: {', '.join(topics)}"
         self.notes: list[str] = []
-        self.front = 0.0
+        self.front, self.times = 0.0, np.zeros(1)  # the only moment is now
         self.told: Callable[[], object] = lambda: None
         """Called from another thread when there is something new."""
         self._changed = threading.Condition()
@@ -41,11 +40,6 @@ class LiveFilm:
         self._since: float | None = None
         self._heard = {*topics}
         self._topics = LiveTopics(dict.fromkeys(topics, adapters.MARKER_ARRAY), self._take)
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """The only moment is now."""
-        return np.zeros(1)
 
     def wait(self, until: Callable[[], bool]) -> bool:
         """Waits for the first meshes, of all topics if they come soon; returns whether any came before `until` held."""
@@ -75,7 +69,6 @@ class LiveFilm:
             ]
 
     def close(self) -> None:
-        """Stops listening."""
         self._topics.close()
 
     def _take(self, topic: str, data: bytes) -> None:

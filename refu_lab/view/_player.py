@@ -213,7 +213,6 @@ class Player:
 
 
 def _legend() -> str:
-    """The legend of the clearance bands."""
     lines, below = [], 0.0
     for limit, color in CLEARANCE:
         shade = "#" + "".join(f"{round(255 * channel):02x}" for channel in color)

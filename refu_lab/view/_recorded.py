@@ -49,7 +49,6 @@ class Topology:
 
 
 def is_mesh(marker: Marker) -> bool:
-    """Whether a marker shows triangles."""
     return marker.type == TRIANGLE_LIST and marker.action == ADD and len(marker.points) > 0
 
 
@@ -142,7 +141,6 @@ class RecordedFilm:
     def __init__(self, path: Path, *, progress: bool = False) -> None:
         self.title = path.name
         self.notes: list[str] = []
-        """Warnings for the user."""
         self._spool = tempfile.TemporaryFile()  # noqa: SIM115  (as long as the film)
         self._size = 0
         scene: MarkerScene[_Stored] = MarkerScene(self._store)
@@ -176,18 +174,13 @@ class RecordedFilm:
             raise RefuError(msg)
         self._frames = [shown for _, shown in moments]
         steps = 1e-9 * np.diff([log_time_ns for log_time_ns, _ in moments])
-        self._times = np.append(0.0, np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE_S)))
+        self.times = np.append(0.0, np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE_S)))
+        """Times of the frames, from the first one on [s], shape (T,)."""
         self._spool.flush()
         self._numbers = np.memmap(self._spool, np.float32, "r")
         self.front = _front(path)
 
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Times of the frames, from the first one on [s], shape (T,)."""
-        return self._times
-
     def shapes(self, index: int) -> Sequence[SceneMesh]:
-        """What was recorded at a moment."""
         stored = self._frames[index]
         return [replace(shape, vertices=np.array(self._numbers[place]).reshape(-1, 3)) for shape, place in stored]
 

@@ -145,5 +145,4 @@ class Stage:
 
 
 def _node(name: str) -> str:
-    """A name that can be a node of the scene tree."""
     return name.replace("/", "_")

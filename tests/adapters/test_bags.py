@@ -156,11 +156,12 @@ def reference_bag(path: Path, *, chunk_bytes: int, messages: list[tuple[int, int
         writer.flush()
         times = [time_ns for _, time_ns, _ in messages]
         summaries = [
-            TopicSummary(topic, kind, message_definition(kind).type_hash, QosProfile(), count)
-            for (topic, kind), count in zip(TWO_TOPICS, counts, strict=True)
+            TopicSummary(topic, kind, message_definition(kind).type_hash, QosProfile(), channel)
+            for (topic, kind), channel in zip(TWO_TOPICS, channels, strict=True)
         ]
-        end = max(times, default=0)
-        _, record = dump_metadata(file_name=path.name, topics=summaries, start_ns=min(times, default=end), end_ns=end)
+        end, sent = max(times, default=0), dict(zip(channels, counts, strict=True))
+        when = {"start_ns": min(times, default=end), "end_ns": end}
+        _, record = dump_metadata(file_name=path.name, topics=summaries, counts=sent, **when)
         writer.add_metadata("rosbag2", {"serialized_metadata": record})
         writer.finish()
 

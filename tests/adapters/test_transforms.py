@@ -54,12 +54,12 @@ def test_messages_are_those_of_tf2() -> None:
     data = encode_transforms(ones)
     message = deserialise(data, TF_MESSAGE)
     assert serialise(message, TF_MESSAGE) == data
-    for theirs, sent, back in zip(message.transforms, ones, decode_transforms(data), strict=True):
+    for theirs, sent, back, values in zip(message.transforms, ones, *decode_transforms(data), strict=True):
         assert (theirs.header.frame_id, theirs.child_frame_id) == (sent.parent, sent.child)
-        assert (back.stamp_ns, back.parent, back.child) == (sent.stamp_ns, sent.parent, sent.child)
+        assert back == (sent.stamp_ns, sent.parent, sent.child)
         t, q = theirs.transform.translation, theirs.transform.rotation
         np.testing.assert_array_equal([t.x, t.y, t.z, q.x, q.y, q.z, q.w], [*sent.translation, *sent.quaternion])
-        np.testing.assert_array_equal([*back.translation, *back.quaternion], [*sent.translation, *sent.quaternion])
+        np.testing.assert_array_equal(values, [*sent.translation, *sent.quaternion])
     with pytest.raises(DecodeError):
         decode_transforms(data[:-40])
 

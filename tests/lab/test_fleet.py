@@ -431,7 +431,7 @@ def test_ctrl_c_ends_the_processes_in_silence(first: str) -> None:
         "import time; from refu_lab.fleet._engine import open_engine, run_function\n"
         "with open_engine(2) as engine:\n"
         "    try:\n"
-        "        for _ in engine.run(run_function(time.sleep), [600.0, 0.0, 0.0]): print('up', flush=True)\n"
+        "        for _ in engine.run(run_function(time.sleep), [600.0, 0.0]): print('up', flush=True)\n"
         "    except KeyboardInterrupt: print('interrupted', flush=True)\n"
     )
     command = [sys.executable, "-c", code]

@@ -17,7 +17,7 @@ from refu_core.simulation import DrapeSettings, GarmentDataset, SelectionSetting
 from refu_lab.cli import main
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.replay import replay
-from refu_lab.sources import body_warnings
+from refu_lab.sources import body_warnings, open_source
 
 BAGS = Path(__file__).parents[2] / "bags"
 GARMENT = "short-pant-male"
@@ -90,9 +90,8 @@ def bare(body: str | None = None) -> GarmentPipeline:
 
 def warnings_of(path: Path, pipeline: GarmentPipeline, **options: Any) -> list[str]:
     """What a replay warns of."""
-    return replay(
-        ReplayOptions(input=path, garments=(GARMENT,), backbone="skinned", **options), pipeline=pipeline
-    ).warnings
+    asked = ReplayOptions(input=path, garments=(GARMENT,), backbone="skinned", **options)
+    return replay(asked, source=open_source(asked, pipeline)).warnings
 
 
 def test_betas_of_unknown_meaning_are_warned_of_once(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from refu_lab.commands.replay import RecordingOptions
 from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, PersonMotion
-from refu_lab.view._film import BODY, SKIN, SceneMesh, remembering
+from refu_lab.view._film import BODY, SKIN, SceneMesh
 from refu_lab.view._marks import CLEARANCE, BandFinder, Marking
 from refu_lab.view._player import Player
 from refu_lab.view._recorded import MarkerScene, RecordedFilm, Topology, is_drawable
@@ -246,13 +246,16 @@ def test_the_nearest_frame_of_a_person_is_shown_if_it_is_near(stamps: list[int],
         assert abs(found.stamp_ns / 1e9 - at / 1000) == pytest.approx(gaps.min(), abs=1e-6)
 
 
-def test_what_was_shown_longest_ago_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("refu_lab.view._film._CACHE_BYTES", 3 * 120)
-    made: list[int] = []
-    made_of = remembering(made.append, frame_bytes=120)
-    for index in (0, 1, 2, 0, 3, 0, 1):
-        made_of(index)
-    assert made == [0, 1, 2, 3, 1]
+def test_what_was_shown_longest_ago_is_forgotten(film: DressedFilm, bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame_bytes = sum(shape.vertices.nbytes for shape in film.shapes(0))
+    monkeypatch.setattr("refu_lab.view._dressed._CACHE_BYTES", 3 * frame_bytes)
+    small = DressedFilm([bag], RecordingOptions(input=Path(), garments=SHORTS))
+    shown = [small.shapes(index) for index in (0, 1, 2)]
+    assert small.shapes(0) is shown[0]
+    small.shapes(3)
+    assert small.shapes(0) is shown[0]
+    assert small.shapes(2) is shown[2]
+    assert small.shapes(1) is not shown[1]
 
 
 # ---- marks -----------------------------------------------------------------------------------------------------------
