@@ -5,12 +5,14 @@ from __future__ import annotations
 import errno
 import importlib.util
 import json
+import multiprocessing
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import cache, partial
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -324,8 +326,22 @@ class Deadly:
         return self._engine.run(partial(fleet_tasks.dying, make, self._mark), tasks)
 
 
-def test_workers_that_are_killed_make_the_same_samples(simulated: Path, clips: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def warm_workers() -> Iterator[None]:
+    """Dask's workers are forks of a process that has imported what they do, which takes each of them seconds.
+
+    Those of lab/test_fleet.py begin as a user's do.
+    """
+    dask = pytest.importorskip("dask")
     pytest.importorskip("distributed")
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed.nanny", "refu_core.simulation"])
+    forkserver.ensure_running()  # Dask has a list of its own for one that doesn't run yet
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        yield
+
+
+@pytest.mark.usefixtures("warm_workers")
+def test_workers_that_are_killed_make_the_same_samples(simulated: Path, clips: Path, tmp_path: Path) -> None:
     with open_engine(2) as engine:
         card = simulate(tmp_path / "set", clips, engine=Deadly(engine, tmp_path / "killed"))
     assert (tmp_path / "killed").exists()
