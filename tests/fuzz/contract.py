@@ -128,6 +128,7 @@ class Contract:
 
     def _within_time(self, read: Callable[[Any], None], value: Any) -> None:
         old = signal.signal(signal.SIGPROF, self._time_is_up) if self._has_timer else None
+        compiles, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # modules of a command, at its first call
         self._is_armed = True
         try:
             if self._has_timer:
@@ -135,6 +136,7 @@ class Contract:
             read(value)
         finally:
             self._is_armed = False
+            sys.dont_write_bytecode = compiles
             if self._has_timer:
                 signal.setitimer(signal.ITIMER_PROF, 0)
                 signal.signal(signal.SIGPROF, old or signal.SIG_DFL)
