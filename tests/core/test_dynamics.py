@@ -75,7 +75,8 @@ def turned(pose: NDArray[np.float32], degrees: float) -> NDArray[np.float32]:
     return np.concatenate((root.as_rotvec()[None], pose[1:])).astype(np.float32)
 
 
-def played(motion: Motion, *, until: float, fps: float, seconds: float = 1.0) -> Iterator[SmplFrame]:
+def played(motion: Motion, *, until: float, fps: float, seconds: float = 0.6) -> Iterator[SmplFrame]:
+    """By default a little more than the half second that is remembered."""
     n = round(seconds * fps)
     return (motion(until - (n - i) / fps) for i in range(n + 1))
 
@@ -98,7 +99,7 @@ def as_defined(motion: Motion, now: float) -> NDArray[np.float64]:
 @given(seed=seeds)
 def test_the_past_is_what_its_definition_says(seed: int) -> None:
     motion = a_motion(seed)
-    got = past_of(played(motion, until=10.0, fps=60.0))  # all lags are whole frames then
+    got = past_of(played(motion, until=10.0, fps=60.0, seconds=1.0))  # all lags are whole frames then
     assert got.shape == (len(LAGS), N_PAST)
     np.testing.assert_allclose(got, as_defined(motion, 10.0), atol=1e-5)
 
