@@ -132,8 +132,7 @@ class Aside:
 
     def _means(self, skin: Tensor) -> Tensor:
         weight = self._weight.to(skin)
-        means: Tensor = embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
-        return means
+        return embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
 
     def _recorded_look(self, mesh: Connectivity, weights: Array) -> Any:
         """A launch that finds box, caps and middles (`_places`), and counts middles near the body (`_n_near`)."""

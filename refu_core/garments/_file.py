@@ -173,8 +173,7 @@ def _name_in(path: Path) -> str:
 def _rounded(tensor: torch.Tensor, bits: int) -> NDArray[np.float32]:
     """Rounds to multiples of 2^-bits: the insignificant bits become zeros, which compress to nothing."""
     scale = float(1 << bits)
-    found: NDArray[np.float32] = (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
-    return found
+    return (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:

@@ -53,8 +53,7 @@ class SelfContact:
         away: NDArray[Any] = np.linalg.norm(contact.at(contact.closest(places)) - places, axis=1)
         closest = Surface(vertices, self._body_faces).closest(places).face
         is_within = _are_inside(Winding(torch.from_numpy(self._body_faces)), self.vertices, queries)
-        near: NDArray[np.bool_] = (away <= distance) | (np.isin(closest, self.faces) & is_within)
-        return near
+        return (away <= distance) | (np.isin(closest, self.faces) & is_within)
 
 
 class SelfContactDetector:
@@ -102,11 +101,9 @@ class SelfContactDetector:
         return self._sheet.with_itself(), _are_inside(self._winding, vertices, above)
 
     def _keys(self, pairs: NDArray[np.int32]) -> NDArray[np.int64]:
-        keys: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * len(self._faces) + pairs[:, 1]
-        return keys
+        return pairs[:, 0].astype(np.int64) * len(self._faces) + pairs[:, 1]
 
 
 def _are_inside(winding: Winding, vertices: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.bool_]:
     winding.update(torch.from_numpy(vertices))
-    inside: NDArray[np.bool_] = (winding(torch.from_numpy(points)) > 0).numpy()
-    return inside
+    return (winding(torch.from_numpy(points)) > 0).numpy()

@@ -119,8 +119,7 @@ class ScaleNet(nn.Module):
         # A pose far beyond training may overflow the networks; α = 1 is right to first order.
         usual = 1 - self.least
         bounded = torch.nan_to_num(raw + usual, nan=usual, posinf=_MAX_SCALE, neginf=-_MAX_SCALE)
-        alpha: Tensor = self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
-        return alpha
+        return self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
 
     def of_body(self, z: Tensor) -> VertexScale:
         """α as `Resolver` asks for it, for the one body whose feature is z, shape (M,) or (1, M)."""

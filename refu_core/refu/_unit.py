@@ -38,8 +38,7 @@ def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, m
     deficit = margin - sample.distance[rows]
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     offset = (alpha * deficit).clamp(-MAX_DISPLACEMENT, MAX_DISPLACEMENT)
-    pushed: Tensor = points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
-    return pushed
+    return points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
 
 
 def pushed_rows(distance: Tensor, margin: float) -> Tensor:
