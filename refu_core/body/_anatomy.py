@@ -26,7 +26,6 @@ from refu_core.skeleton import CARRIED, PARENTS
 DEFAULT_GAP = 0.012
 """Room between two parts of a body [m]: for two layers of cloth, each 4 mm off the skin, and some to spare."""
 
-
 FADE = 0.035
 """Skin farther beyond a crease's reach than this isn't held [m]: out there the kept height falls by 1 m per metre."""
 

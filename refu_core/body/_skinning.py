@@ -16,7 +16,6 @@ from refu_core.errors import MeshError
 _MIN_DETERMINANT = 1e-4
 """Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
 
-
 _skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transform, wp.int32, wp.vec3))
 
 
