@@ -70,7 +70,6 @@ class ExactSdf(MeshSdf):
         self._rebuild_distance = rebuild_distance
         self._built_at = memory(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
-        self._none = torch.empty(0, dtype=torch.int32, device=self.device)
 
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new or self._has_drifted():
