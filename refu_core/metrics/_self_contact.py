@@ -79,9 +79,8 @@ class SelfContactDetector:
     def detect(self, body_vertices: Any) -> SelfContact:
         """The self-contact of a posed body, `body_vertices` [m], shape (V, 3). Raises `MeshError` for other shapes."""
         vertices = as_vertices("body_vertices", body_vertices)
-        if len(vertices) != len(self._rest_buried):
-            msg = f"body_vertices must have the rest pose's shape ({len(self._rest_buried)}, 3), got {vertices.shape}"
-            raise MeshError(msg)
+        if (n := len(self._rest_buried)) != len(vertices):
+            raise MeshError(f"body_vertices must have the rest pose's shape ({n}, 3), got {vertices.shape}")
         pairs, buried = self._contacts(vertices)
         pairs = pairs[~np.isin(self._keys(pairs), self._rest_pairs)]
         # Skin enters another part by crossing its skin: what seems buried without that is a fold that nearly touches.
