@@ -27,18 +27,9 @@ _LONGEST = 8
 Vector = tuple[float, float, float]
 
 
-def simplify(
-    shapes: NDArray[np.float64], faces: NDArray[np.int32], most: int
-) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Collapses edges until twice the faces and a wall along the boundary are at most `most` triangles, if possible.
+class CoarseSheet:
+    """A mesh with `faces` (F, 3) in several `shapes` (P, V, 3) [m]; no collapse turns a triangle over in the first."""
 
-    `shapes` (P, V, 3) [m] are those of one mesh with `faces` (F, 3); no collapse turns a triangle over in the first.
-    Returns the vertices that are kept, (K,), and faces that index these, (G, 3).
-    """
-    return _Sheet(shapes, faces).collapsed(most)
-
-
-class _Sheet:
     def __init__(self, shapes: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
         mesh = Connectivity.of(faces, shapes.shape[1])
         self.places: list[Vector] = [tuple(row) for row in shapes[0].tolist()]
@@ -69,6 +60,10 @@ class _Sheet:
         self.areas = np.mean(areas, axis=0)
 
     def collapsed(self, most: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        """Collapses edges until twice the faces and a wall along the boundary are at most `most` triangles, if it can.
+
+        Returns the vertices that are kept, (K,), and faces that index these, (G, 3).
+        """
         edges = [(u, v) for u, ring in enumerate(self.ring) for v in ring]
         heap = [(price, u, v, 0) for price, u, v in self._options(edges)]
         heapq.heapify(heap)
@@ -82,8 +77,7 @@ class _Sheet:
             age[v] += 1
             for price, a, b in self._options([pair for w in self.ring[v] for pair in ((v, w), (w, v))]):
                 heapq.heappush(heap, (price, a, b, age[a] + age[b]))
-        faces = np.array(list(self.faces.values()), np.int64)
-        kept, of_corner = np.unique(faces, return_inverse=True)
+        kept, of_corner = np.unique(np.array(list(self.faces.values())), return_inverse=True)
         return kept.astype(np.intp), of_corner.reshape(-1, 3).astype(np.int32)
 
     def _options(self, edges: Sequence[tuple[int, int]]) -> Iterator[tuple[float, int, int]]:
