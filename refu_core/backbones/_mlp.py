@@ -41,14 +41,10 @@ class Mlp(WithoutWearerCode, nn.Module):
         self.net = Perceptron(n, config.hidden, decoder.size, activation=config.activation, dropout=config.dropout)
 
     def forward(
-        self,
-        betas: Tensor,
-        pose: Tensor,
-        style: Tensor | None,
-        *,
-        wearer_code: Tensor | None = None,  # noqa: ARG002
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
     ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
+        del wearer_code  # there is none
         displacement: Tensor = self.decoder(self.code(self.features(pose), style_shape(betas, style)))
         return displacement
 
