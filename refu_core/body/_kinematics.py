@@ -26,8 +26,7 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     if is_plain(rotvec):
         flat = rotvec.reshape(-1, 3).contiguous()
         matrices = rotvec.new_empty(*rotvec.shape, 3)
-        if len(flat):
-            _rotate((len(flat),), flat, matrices.view(-1, 3, 3))
+        _rotate((len(flat),), flat, matrices.view(-1, 3, 3))
         return matrices
     angle2 = (rotvec * rotvec).sum(-1)
     small = angle2 < 1e-4 if rotvec.dtype == torch.float32 else angle2 < 1e-8
@@ -68,9 +67,8 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
     if is_plain(rotations, joints):
         turned = torch.empty_like(rotations, memory_format=torch.contiguous_format)
         translation, posed = rotations.new_empty(2, batch, n, 3)
-        if batch:
-            inputs = rotations.contiguous(), joints.contiguous(), _parents(rotations.device)
-            _chain((batch,), *inputs, turned, translation, posed)
+        inputs = rotations.contiguous(), joints.contiguous(), _parents(rotations.device)
+        _chain((batch,), *inputs, turned, translation, posed)
         return posed, RigidTransforms(turned, translation)
     turns, places = [rotations[:, 0]], [joints[:, 0].expand(batch, 3)]
     for joint, parent in enumerate(PARENTS[1:], start=1):

@@ -72,9 +72,8 @@ class Skinning:
             return apply_transforms(points, blend_transforms(self._weights, transforms))
         points, stacked = points.contiguous(), _stacked(transforms)
         posed = points.new_empty(batch, n, 3)
-        if batch:
-            n_strips, each = strips(n, posed.device)
-            _skin((batch, n_strips), points, *self._by_joint, stacked, each, posed)
+        n_strips, each = strips(n, posed.device)
+        _skin((batch, n_strips), points, *self._by_joint, stacked, each, posed)
         return posed
 
 

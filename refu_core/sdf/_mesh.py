@@ -46,8 +46,7 @@ def ask(kernel: Repeated, points: Tensor, *more: Tensor) -> Found:
     n = len(points)
     face = torch.empty(n, dtype=torch.int32, device=points.device)
     found = Found(face, points.new_empty(n), points.new_empty(n, 3))
-    if n:
-        kernel((n,), points, *more, *found)
+    kernel((n,), points, *more, *found)
     return found
 
 
@@ -123,8 +122,7 @@ class MeshSdf(ABC):
         """`signed_distance`'s `kind`, int32 (N,), barycentrics and unit pseudo-normals, (N, 3), of closest faces."""
         kind = torch.empty_like(face)
         barycentrics, normal = points.new_empty(2, len(face), 3)
-        if len(face):
-            self._find_features((len(face),), points, face, kind, barycentrics, normal)
+        self._find_features((len(face),), points, face, kind, barycentrics, normal)
         return kind, barycentrics, normal
 
     def skin(self) -> Any:
