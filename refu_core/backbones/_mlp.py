@@ -45,10 +45,8 @@ class Mlp(WithoutWearerCode, nn.Module):
     ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
         del wearer_code  # there is none
-        displacement: Tensor = self.decoder(self.code(self.features(pose), style_shape(betas, style)))
-        return displacement
+        return self.decoder(self.code(self.features(pose), style_shape(betas, style)))
 
     def code(self, x: Tensor, s: Tensor) -> Tensor:
         """Code, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""
-        code: Tensor = self.net(torch.cat((x, s), 1))
-        return code
+        return self.net(torch.cat((x, s), 1))

@@ -299,8 +299,7 @@ class SmplBody:
         joints, transforms = forward_kinematics(rotations, shape.joints)
         vertices = shape.vertices
         if self._posedirs is not None:
-            eye = torch.eye(3, dtype=self.dtype, device=self.device)
-            feature = (rotations[:, 1:] - eye).flatten(1)
+            feature = (rotations[:, 1:] - torch.eye(3, dtype=self.dtype, device=self.device)).flatten(1)
             vertices = vertices + (feature @ self._posedirs.T).view(len(pose), vertices.shape[1], 3)
         return BodyOutput(self._skinning(vertices, transforms), joints, transforms)
 

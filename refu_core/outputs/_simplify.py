@@ -35,8 +35,7 @@ class CoarseSheet:
         self.places: list[Vector] = [tuple(row) for row in shapes[0].tolist()]
         self.shapes = np.ascontiguousarray(shapes.transpose(1, 0, 2))
         x, y, z = np.moveaxis(self.shapes, -1, 0)
-        one = np.ones_like(x)
-        terms = (x * x, 2 * x * y, 2 * x * z, 2 * x, y * y, 2 * y * z, 2 * y, z * z, 2 * z, one)
+        terms = (x * x, 2 * x * y, 2 * x * z, 2 * x, y * y, 2 * y * z, 2 * y, z * z, 2 * z, np.ones_like(x))
         self.terms = np.stack(terms, -1).reshape(len(self.shapes), -1)
         """What a quadric is multiplied by to get its value at each vertex, shape (V, 10 P)."""
         self.faces: dict[int, tuple[int, int, int]] = dict(enumerate(map(tuple, faces.tolist())))
@@ -162,8 +161,7 @@ def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[NDArra
     for corner in range(3):
         rim = mesh.n_faces_of_edge[mesh.edge_of_corner[:, corner]] == 1
         start, end = mesh.faces[rim, corner], mesh.faces[rim, (corner + 1) % 3]
-        along = vertices[end] - vertices[start]
-        out = np.cross(along, normal[rim])
+        out = np.cross(vertices[end] - vertices[start], normal[rim])
         length = np.linalg.norm(out, axis=1)
         out /= np.maximum(length, 1e-18)[:, None]
         wall = np.concatenate((out, -(out * vertices[start]).sum(1, keepdims=True)), axis=1)

@@ -120,8 +120,7 @@ class ExactSdf(MeshSdf):
         near = None if near is None else self._checked_faces(near, len(where), least=-1)
         found = self._find(where, near, min(max_distance, _UNLIMITED))
         _, barycentrics, _ = self._features(where, found.face)
-        sign = torch.where(found.distance < 0, -1.0, 1.0)
-        return ClosestPoints(found.face, barycentrics, found.distance.abs(), sign)
+        return ClosestPoints(found.face, barycentrics, found.distance.abs(), torch.where(found.distance < 0, -1.0, 1.0))
 
     def _find(self, points: Tensor, near: Tensor | None, max_distance: float = _UNLIMITED) -> Found:
         farthest = points.new_full((1,), max_distance)

@@ -86,8 +86,7 @@ class SdfNetwork(nn.Module):
 
         `pose`, shape (B, 23, 3) [rad], is without the root's rotation, which is to be undone in the points.
         """
-        condition = self.condition(torch.cat((betas, pose.flatten(1)), 1))
-        h = self.activation(self.point(points) + condition[:, None])
+        h = self.activation(self.point(points) + self.condition(torch.cat((betas, pose.flatten(1)), 1))[:, None])
         for number, layer in enumerate(self.layers, start=1):
             h = self.activation(layer(torch.cat((h, points.to(h.dtype)), -1) if number == self.config.skip else h))
         distance: Tensor = self.last(h)[..., 0]
