@@ -5,7 +5,7 @@ from its own package: `keypoints` and `recordings` (the input), `body`, `garment
 paper's layer), `contact` (brings a garment off the body), `realtime`, `outputs` (what robots ask about dressed people),
 `observation` (fitting to a camera's points), `metrics`, `simulation`, `training`. The most used names are here, too.
 
-Most names are imported on first use, so that code that only needs `SmplFrame` doesn't wait for torch and warp.
+Names are imported on first use, so that code that only needs `SmplFrame` doesn't wait for torch and warp.
 """
 
 from __future__ import annotations
@@ -16,55 +16,45 @@ from typing import TYPE_CHECKING, Any
 
 from refu_core._collector import paused
 from refu_core._versions import VERSION
-from refu_core.errors import BodyError, FrameError, GarmentError, MeshError, RefuError, WeightsError
-from refu_core.frames import SmplFrame
-from refu_core.modes import BackboneName, SdfMode
 
 if TYPE_CHECKING:
-    from refu_core.body import SmplBody, load_body
-    from refu_core.contact import Resolver
-    from refu_core.garments import GarmentTemplate, load_garment
-    from refu_core.history import PoseHistory
-    from refu_core.realtime import GarmentPipeline, PipelineOutput, Wearer, dress
-    from refu_core.refu import Refu
-    from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf, SdfSample
+    from refu_core.body import SmplBody as SmplBody
+    from refu_core.body import load_body as load_body
+    from refu_core.contact import Resolver as Resolver
+    from refu_core.errors import BodyError as BodyError
+    from refu_core.errors import FrameError as FrameError
+    from refu_core.errors import GarmentError as GarmentError
+    from refu_core.errors import MeshError as MeshError
+    from refu_core.errors import RefuError as RefuError
+    from refu_core.errors import WeightsError as WeightsError
+    from refu_core.frames import SmplFrame as SmplFrame
+    from refu_core.garments import GarmentTemplate as GarmentTemplate
+    from refu_core.garments import load_garment as load_garment
+    from refu_core.history import PoseHistory as PoseHistory
+    from refu_core.modes import BackboneName as BackboneName
+    from refu_core.modes import SdfMode as SdfMode
+    from refu_core.realtime import GarmentPipeline as GarmentPipeline
+    from refu_core.realtime import PipelineOutput as PipelineOutput
+    from refu_core.realtime import Wearer as Wearer
+    from refu_core.realtime import dress as dress
+    from refu_core.refu import Refu as Refu
+    from refu_core.sdf import ApproxSdf as ApproxSdf
+    from refu_core.sdf import BandSdf as BandSdf
+    from refu_core.sdf import BodySdf as BodySdf
+    from refu_core.sdf import ExactSdf as ExactSdf
+    from refu_core.sdf import SdfSample as SdfSample
 
 __version__ = VERSION
-__all__ = [
-    "ApproxSdf",
-    "BackboneName",
-    "BandSdf",
-    "BodyError",
-    "BodySdf",
-    "ExactSdf",
-    "FrameError",
-    "GarmentError",
-    "GarmentPipeline",
-    "GarmentTemplate",
-    "MeshError",
-    "PipelineOutput",
-    "PoseHistory",
-    "Refu",
-    "RefuError",
-    "Resolver",
-    "SdfMode",
-    "SdfSample",
-    "SmplBody",
-    "SmplFrame",
-    "Wearer",
-    "WeightsError",
-    "dress",
-    "load_body",
-    "load_garment",
-]
-
 _LAZY = {
     name: package
     for package, names in {
         "body": ("SmplBody", "load_body"),
         "contact": ("Resolver",),
+        "errors": ("BodyError", "FrameError", "GarmentError", "MeshError", "RefuError", "WeightsError"),
+        "frames": ("SmplFrame",),
         "garments": ("GarmentTemplate", "load_garment"),
         "history": ("PoseHistory",),
+        "modes": ("BackboneName", "SdfMode"),
         "realtime": ("GarmentPipeline", "PipelineOutput", "Wearer", "dress"),
         "refu": ("Refu",),
         "sdf": ("ApproxSdf", "BandSdf", "BodySdf", "ExactSdf", "SdfSample"),
@@ -72,6 +62,7 @@ _LAZY = {
     for name in names
 }
 """The package that each name is imported from on first use."""
+__all__ = sorted(_LAZY)
 
 
 def _packages() -> set[str]:

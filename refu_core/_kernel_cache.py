@@ -86,10 +86,8 @@ def _build(module: Any, folder: Path, plain: Callable[[], Any]) -> Any:
     module.mark_modified()  # makes Warp forget that it has failed
     try:
         loaded = plain()
-    except OSError:
-        raise
     except Exception as error:
-        if is_device_loss(error):
+        if isinstance(error, OSError) or is_device_loss(error):
             raise
         msg = f"the kernels of {module.name} can't be built ({error}): delete {folder} and try again"
         raise RefuError(msg) from error

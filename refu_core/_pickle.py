@@ -99,32 +99,25 @@ class PickledArrays:
         if last >= len(flat):
             raise ValueError(f"a tensor that reaches to number {last} of {len(flat)}")
         steps = tuple(stride * flat.itemsize for stride in strides)
-        view: NDArray[Any] = np.lib.stride_tricks.as_strided(flat[offset:], shape, steps, writeable=False)
-        dense: NDArray[Any] = view.copy()
-        return dense
+        return np.array(np.lib.stride_tricks.as_strided(flat[offset:], shape, steps, writeable=False), order="C")
 
     def _sparse(self, kind: str, state: dict[str, Any]) -> NDArray[Any]:
         """A `scipy.sparse` matrix: compressed columns, compressed rows, or coordinates."""
         rows, columns = (operator.index(n) for n in exactly(tuple, state["_shape" if "_shape" in state else "shape"]))
-        places = [state[key] for key in ("indices", "indptr")] if kind != "coo" else _coordinates(state)
+        if kind != "coo":
+            places = [state["indices"], state["indptr"]]
+        else:  # SciPy names them otherwise since its version 1.13
+            places = [state["row"], state["col"]] if "row" in state else exactly(tuple, state["coords"])
         data, first, second = (self.of(part).reshape(-1) for part in (state["data"], *places))
         self._budget.take((rows, columns), np.dtype(np.float64))
         if not first.dtype.kind == second.dtype.kind == "i":
             raise ValueError(f"a sparse matrix with places of {first.dtype} and {second.dtype}")
         numbers = data.astype(np.float64)
         if kind == "coo":
-            if not len(numbers) == len(first) == len(second):
-                msg = f"a sparse matrix of {len(numbers)} numbers in {len(first)} rows and {len(second)} columns"
-                raise ValueError(msg)
             return coo_array((numbers, (first, second)), shape=(rows, columns)).toarray()
         matrix = (csc_array if kind == "csc" else csr_array)((numbers, first, second), shape=(rows, columns))
         matrix.check_format(full_check=True)
         return matrix.toarray()
-
-
-def _coordinates(state: dict[str, Any]) -> list[Any]:
-    """Rows and columns of the entries of a sparse matrix; SciPy names them otherwise since its version 1.13."""
-    return [state["row"], state["col"]] if "row" in state else list(exactly(tuple, state["coords"]))
 
 
 def _unread(value: Any) -> str:
@@ -151,8 +144,7 @@ def read_smpl_pickle(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of an official SMPL `.pkl` that are named in `keys`.
 
-    Raises:
-        error: the file is too large, isn't a pickle, isn't a model, or holds anything but arrays under one of the keys.
+    Raises `error`: it is too large, isn't a pickle, isn't a model, or holds anything but arrays under one of the keys.
     """
     with open_file(path, most=MAX_PICKLE_BYTES, error=error, wanted=wanted) as file:
         try:

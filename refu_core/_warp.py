@@ -95,7 +95,12 @@ class Repeated(threading.local):
         self._known: dict[Any, tuple[Any, list[Any]]] = {}
 
     def __call__(self, dim: Sequence[int], *tensors: Tensor) -> None:
-        """Launches with contiguous tensors of one device, which are kept alive until the next launch of these sizes."""
+        """Launches with contiguous tensors of one device, which are kept alive until the next launch of these sizes.
+
+        Does nothing if a size in `dim` is zero.
+        """
+        if not all(dim):
+            return
         device = tensors[0].device
         key = (device, *dim, *(tensor.shape for tensor in tensors), *(tensor.dtype for tensor in tensors))
         if key not in self._known:

@@ -119,5 +119,4 @@ def _past(moments: Sequence[_Moment]) -> NDArray[np.float32]:
     turned = rotations - now.rotations
     turned[:, 0] = root.T @ turned[:, 0]
     beside = (way - _LAGS[:, None] / _LAGS[-1] * way[-1]) @ root
-    past = np.concatenate((turned.reshape(len(_LAGS), -1), beside), 1)
-    return past.astype(np.float32)
+    return np.concatenate((turned.reshape(len(_LAGS), -1), beside), 1).astype(np.float32)

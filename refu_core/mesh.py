@@ -74,8 +74,7 @@ class Connectivity:
     @property
     def boundary(self) -> NDArray[np.int32]:
         """The edges that have only one face, shape (B, 2)."""
-        boundary: NDArray[np.int32] = self.edges[self.n_faces_of_edge == 1]
-        return boundary
+        return np.compress(self.n_faces_of_edge == 1, self.edges, axis=0)
 
     @cached_property
     def ring(self) -> Adjacency:
@@ -101,24 +100,15 @@ class Connectivity:
 
     def require_closed(self) -> None:
         """Raises `MeshError` where the mesh isn't a closed, consistently oriented surface."""
-        if self._fault:
-            raise MeshError(self._fault)
-
-    @cached_property
-    def _fault(self) -> str:
-        """Why the mesh isn't closed; empty if it is."""
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         n_faces = self.n_faces_of_edge
         n_open, n_crowded = int((n_faces == 1).sum()), int((n_faces > 2).sum())
         one_way = np.bincount(self.edge_of_corner.ravel(), weights=np.where(end > start, 1.0, -1.0)) != 0
         n_flipped = int(one_way[n_faces == 2].sum())
         if n_open or n_crowded or n_flipped:
-            edges = (
-                f"{n_open} open edges, {n_crowded} edges of more than two faces and {n_flipped} edges whose two faces "
-            )
-            fault = f"{edges}face opposite ways; close the mesh and orient its faces outward"
-            return f"a signed distance needs a watertight body: {fault}"
-        return ""
+            edges = f"{n_open} open edges, {n_crowded} edges of more than two faces and {n_flipped} edges whose two"
+            fault = f"{edges} faces face opposite ways; close the mesh and orient its faces outward"
+            raise MeshError(f"a signed distance needs a watertight body: {fault}")
 
     @cached_property
     def across(self) -> NDArray[np.int32]:

@@ -67,7 +67,7 @@ def smpl_arrays(gender: str = "female", *, n_betas: int = 10, seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     how = OF[gender]
     body = load_body(gender, dtype=torch.float64)
-    known, mesh = body._arrays, Connectivity.of(body.faces)
+    known, mesh = body.arrays, Connectivity.of(body.faces)
     # In another rest pose, of another mean shape.
     pose = np.zeros((1, 24, 3))
     pose[0, 1, 2], pose[0, 2, 2] = -how.legs_together, how.legs_together

@@ -11,7 +11,6 @@ WIDTH = 16
 ROWS = wp.constant(4)
 """How many codes a strip is multiplied by at a time."""
 
-
 if TYPE_CHECKING:
     Strip = wp.Vector[float]
     Steps = wp.Vector[wp.int8]

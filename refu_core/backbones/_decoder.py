@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -90,6 +90,8 @@ _STEPS = 127
 class DenseDecoder(nn.Module):
     """The code is the displacements themselves (preset `paper`)."""
 
+    __call__: Callable[..., Tensor]
+
     def __init__(self, n_vertices: int) -> None:
         super().__init__()
         self.n_vertices = n_vertices
@@ -120,6 +122,8 @@ class BasisDecoder(nn.Module):
     A basis made from few samples is smooth. It is stored at `controls`, in a hundredth of the bytes or less, and is
     expanded to all vertices when it is loaded.
     """
+
+    __call__: Callable[..., Tensor]
 
     def __init__(self, mean: Tensor, components: Tensor, *, controls: Controls | None = None) -> None:
         """`mean` [m], shape (V, 3), and orthonormal rows `components`, shape (R, 3 V).

@@ -56,8 +56,7 @@ class Dynamics(nn.Module):
         now = torch.cat((x[:, self._now], s), 1)
         both = torch.cat((torch.cat((now, moved), 1), torch.cat((now, torch.zeros_like(moved)), 1)))
         with_past, without = self.net(both).chunk(2)
-        code: Tensor = with_past - without
-        return code
+        return with_past - without
 
     def seen(self, past: Tensor) -> Tensor:
         """What it sees of the past (B, 4, 219), shape (B, P)."""
@@ -103,5 +102,4 @@ class Dynamic(nn.Module):
         code = self.still.code(x, s, wearer_code)
         if past is not None:
             code = code + self.dynamics(x, s, past)
-        displacement: Tensor = self.still.decoder(code)
-        return displacement
+        return self.still.decoder(code)

@@ -26,8 +26,7 @@ class LaplacianSmoothing:
 
     def __call__(self, vertices: Tensor) -> Tensor:
         """Smoothed vertices [m] of the same shape (..., V, 3)."""
-        columns = vertices.detach().cpu().movedim(-2, 0)
-        return self._apply(self._map, columns).movedim(0, -2).to(vertices)
+        return self._apply(self._map, vertices.detach().cpu().movedim(-2, 0)).movedim(0, -2).to(vertices)
 
     def transposed(self, components: Tensor) -> Tensor:
         """`components` @ S of the same shape (R, 3 V), where S smooths: (components @ S) @ x = components @ (S x)."""

@@ -187,14 +187,10 @@ class Gcnn(WithoutWearerCode, nn.Module):
         self.scale: Tensor
 
     def forward(
-        self,
-        betas: Tensor,
-        pose: Tensor,
-        style: Tensor | None,
-        *,
-        wearer_code: Tensor | None = None,  # noqa: ARG002
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
     ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
+        del wearer_code  # there is none
         z = self.head(torch.cat((self.features(pose), style_shape(betas, style)), 1))
         x = z.view(len(z), -1, self.config.channels[0]).transpose(0, 1)
         for layer in self.layers[:-1]:

@@ -67,8 +67,7 @@ class Lying(nn.Module):
 
     def forward(self, seen: Tensor) -> Tensor:
         """Code of what is added, shape (B, R), from what is `seen` (B, I)."""
-        code: Tensor = lying_share(seen[:, :3])[:, None] * self.net(seen)
-        return code
+        return lying_share(seen[:, :3])[:, None] * self.net(seen)
 
 
 class WithLying(nn.Module):
@@ -96,5 +95,4 @@ class WithLying(nn.Module):
         assert displacement is not None  # there are weights
         if self._is_serial and not any(map(is_lying, pose[:, 0].tolist())):
             return displacement
-        added: Tensor = self.lying.decoder(self.lying(self.lying.seen(betas, pose, style)))
-        return displacement + added
+        return displacement + self.lying.decoder(self.lying(self.lying.seen(betas, pose, style)))

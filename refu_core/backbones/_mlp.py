@@ -41,18 +41,12 @@ class Mlp(WithoutWearerCode, nn.Module):
         self.net = Perceptron(n, config.hidden, decoder.size, activation=config.activation, dropout=config.dropout)
 
     def forward(
-        self,
-        betas: Tensor,
-        pose: Tensor,
-        style: Tensor | None,
-        *,
-        wearer_code: Tensor | None = None,  # noqa: ARG002
+        self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
     ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
-        displacement: Tensor = self.decoder(self.code(self.features(pose), style_shape(betas, style)))
-        return displacement
+        del wearer_code  # there is none
+        return self.decoder(self.code(self.features(pose), style_shape(betas, style)))
 
     def code(self, x: Tensor, s: Tensor) -> Tensor:
         """Code, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""
-        code: Tensor = self.net(torch.cat((x, s), 1))
-        return code
+        return self.net(torch.cat((x, s), 1))

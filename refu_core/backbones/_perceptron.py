@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
@@ -22,6 +22,7 @@ class _Standardised(nn.Module):
     Out there, cloth is that of the nearest known pose, posed anew.
     """
 
+    __call__: Callable[..., Tensor]
     shift: Tensor
     scale: Tensor
     lowest: Tensor

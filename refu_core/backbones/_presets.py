@@ -25,7 +25,7 @@ from refu_core.errors import WeightsError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.modes import BackboneName, SdfMode
-from refu_core.weights import Weights, build_for, config_of_card, load_weights, save_weights, weights_folder
+from refu_core.weights import Weights, build_for, config_of_card, load_weights, naming, save_weights, weights_folder
 
 PRESETS: tuple[str, ...] = ("realtime", "paper")
 """`realtime` has low-rank heads and sizes for a CPU, `paper` the sizes of the paper."""
@@ -97,10 +97,8 @@ def require_basis(folder: Path, digest: str | None, *, written: Sequence[str]) -
 def load_basis(folder: Path, garment: GarmentTemplate, *, expect: Mapping[str, Any]) -> tuple[BasisDecoder, str]:
     """The output basis of a garment and its hash. Raises `WeightsError` as `refu_core.weights.load_weights` does."""
     weights = load_weights(folder / "basis", expect=expect)
-    try:
+    with naming(weights.path):
         basis = BasisDecoder.of_tensors(weights.tensors, garment)
-    except WeightsError as error:
-        raise WeightsError(f"{weights.path}: {error}") from error
     return basis, str(weights.card["sha256"])
 
 
@@ -138,9 +136,10 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
     """
     card, template = weights.card, garment.to(device="cpu")
     name = str(card.get("backbone"))
-    if name not in _CONFIGS:
-        raise WeightsError(f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again")
-    config = config_of_card(_CONFIGS[name], card.get("config"))
+    with naming(weights.path):
+        if name not in _CONFIGS:
+            raise WeightsError(f"a card of a backbone {name[:80]!r} that this version doesn't know; train it again")
+        config = config_of_card(_CONFIGS[name], card.get("config"))
     basis = None
     if "basis_sha256" in card:
         identity = {key: card[key] for key in ("garment", "body_fingerprint") if key in card}
@@ -149,15 +148,12 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
             raise WeightsError(f"{weights.path}: made for another basis than the one beside it; get both files again")
     tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
     build = partial(build_backbone, config, template, basis=basis, pivots=tensors.get("pivots"))
-    try:
+    with naming(f"{weights.path}: doesn't fit {garment.name}"):
         module = build_for(tensors, build, shared="decoder.")
-    except WeightsError as error:
-        raise WeightsError(f"{weights.path}: doesn't fit {garment.name}: {error}") from error
     module = module.float().to(device).eval()
     with torch.no_grad():
-        rest = memory(1, N_BETAS, device=device), memory(1, N_JOINTS, 3, device=device)
-        at_rest = module(*rest, None)
-    offset = 0.0 if at_rest is None else float(at_rest.abs().max())
+        at_rest = module(memory(1, N_BETAS, device=device), memory(1, N_JOINTS, 3, device=device), None)
+    offset = float(at_rest.abs().max())
     if not offset <= MAX_OFFSET:  # also refuses NaN
         msg = f"{weights.path}: wanted a garment within {MAX_OFFSET:g} m of a body at rest, this one is "
         msg += f"{offset:.3g} m off; train it again"
@@ -167,7 +163,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
 
 def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> Path:
     """Writes a garment's dynamics, `folder`/dynamics. Raises `WeightsError` also if there is no basis."""
-    return _save_addition(folder / "dynamics", dynamics, dynamics.config, card, {})
+    return _save_addition(folder / "dynamics", dynamics, card, {})
 
 
 def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
@@ -183,15 +179,14 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
         raise WeightsError(f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}")
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
     stored = load_weights(weights.path.with_name("dynamics"), expect=expect)
-    config = config_of_card(DynamicsConfig, stored.card.get("config"))
+    with naming(stored.path):
+        config = config_of_card(DynamicsConfig, stored.card.get("config"))
     if not set(config.joints) <= {0, *network.config.joints}:
         msg = f"{stored.path}: wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got "
         msg += f"{config.joints}; train it again"
         raise WeightsError(msg)
-    try:
+    with naming(f"{stored.path}: doesn't fit {weights.path.name}"):
         dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
-    except WeightsError as error:
-        raise WeightsError(f"{stored.path}: doesn't fit {weights.path.name}: {error}") from error
     dynamics = dynamics.float().to(next(network.parameters()).device)
     return Dynamic(network, dynamics).eval().requires_grad_(False)
 
@@ -202,20 +197,16 @@ _BASIS = "basis."
 def save_lying(folder: Path, lying: Lying, card: Mapping[str, Any]) -> Path:
     """Writes what lying does to a garment, `folder`/lying. Raises `WeightsError` also if there is no basis."""
     basis = {_BASIS + k: v for k, v in lying.decoder.tensors().items()}
-    return _save_addition(folder / "lying", lying, lying.config, card, basis)
+    return _save_addition(folder / "lying", lying, card, basis)
 
 
 def _save_addition(
-    stem: Path,
-    network: Module,
-    config: DynamicsConfig | LyingConfig,
-    card: Mapping[str, Any],
-    others: dict[str, Tensor],
+    stem: Path, network: Dynamics | Lying, card: Mapping[str, Any], others: Mapping[str, Tensor]
 ) -> Path:
     """Writes what is added to a backbone, beside it; its card names the backbone's basis."""
     basis = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
-    described = {"config": asdict(config), "basis_sha256": str(basis.card["sha256"])}
-    return save_weights(stem, _own_tensors(network, half=True) | dict(others), {**described, **card})
+    described = {"config": asdict(network.config), "basis_sha256": str(basis.card["sha256"])}
+    return save_weights(stem, {**_own_tensors(network, half=True), **others}, {**described, **card})
 
 
 def _own_tensors(network: Module, *, half: bool) -> dict[str, Tensor]:
@@ -235,15 +226,13 @@ def with_lying(network: Backbone, weights: Weights) -> Backbone:
         return network
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
     stored = load_weights(weights.path.with_name("lying"), expect=expect)
-    config = config_of_card(LyingConfig, stored.card.get("config"))
     tensors = {k: v for k, v in stored.tensors.items() if not k.startswith(_BASIS)}
-    try:
+    with naming(stored.path):
+        config = config_of_card(LyingConfig, stored.card.get("config"))
         decoder = BasisDecoder.of_tensors({k[len(_BASIS) :]: v for k, v in stored.tensors.items() if k not in tensors})
         if decoder.n_vertices != (n := getattr(network, "decoder").n_vertices):  # noqa: B009 - a trained one has it
             raise WeightsError(f"wanted {n} vertices, got {decoder.n_vertices}; train it again")
         lying = build_for(tensors, lambda: Lying(config, decoder), shared="decoder.")
-    except WeightsError as error:
-        raise WeightsError(f"{stored.path}: {error}") from error
     device = next(network.parameters()).device if isinstance(network, Module) else "cpu"
     return WithLying(network, lying.float().to(device)).eval().requires_grad_(False)
 
@@ -251,18 +240,12 @@ def with_lying(network: Backbone, weights: Weights) -> Backbone:
 def load_backbone(
     name: str, garment: str | GarmentTemplate, *, mode: str = "none", folder: Path | None = None
 ) -> Backbone:
-    """The trained backbone `name` of a garment.
+    """The trained backbone `name` of a garment: `skinned`, `tailornet`, `dynamic`, `mlp`, `gcnn`, or `auto`.
 
-    Args:
-        name: `skinned`, `tailornet`, `dynamic`, `mlp`, `gcnn`, or `auto`: `dynamic` or `tailornet` where it ships, else
-            `skinned`.
-        garment: name of a garment, or a template.
-        mode: what it was trained with: `none`, `approx`, `accurate` or `hybrid`.
-        folder: where its files lie; the shipped weights if not given.
+    `auto` is `dynamic` or `tailornet` where it ships, else `skinned`. `mode` is what it was trained with: `none`,
+    `approx`, `accurate` or `hybrid`; `folder` is where its files lie, by default the shipped weights.
 
-    Raises:
-        GarmentError: there is no such garment.
-        WeightsError: there is no such backbone or mode, or no weights of it.
+    Raises `GarmentError` for no such garment, and `WeightsError` for no such backbone or mode, or no weights of it.
     """
     template = load_garment(garment) if isinstance(garment, str) else garment
     weights = backbone_weights(name, template.name, mode=mode, folder=folder)

@@ -74,19 +74,15 @@ class TailorNet(nn.Module):
         self, betas: Tensor, pose: Tensor, style: Tensor | None, *, wearer_code: Tensor | None = None
     ) -> Tensor:
         """Predicts for betas (B, 10), pose (B, 24, 3) [rad], style (B, 4) and, where it is known, their code (B, K)."""
-        code = self.code(self.features(pose), style_shape(betas, style), wearer_code)
-        displacement: Tensor = self.decoder(code)
-        return displacement
+        return self.decoder(self.code(self.features(pose), style_shape(betas, style), wearer_code))
 
     def code(self, x: Tensor, s: Tensor, mixture: Tensor | None = None) -> Tensor:
         """Code, shape (B, C), of pose features (B, I), (β, γ) (B, 14) and, where it is known, their mixture (B, K)."""
-        code: Tensor = self.low_code(x, s) + self.high(x, self.mixture(s) if mixture is None else mixture)
-        return code
+        return self.low_code(x, s) + self.high(x, self.mixture(s) if mixture is None else mixture)
 
     def low_code(self, x: Tensor, s: Tensor) -> Tensor:
         """Code of D_LF, shape (B, C), of pose features (B, I) and (β, γ) (B, 14)."""
-        code: Tensor = self.low(torch.cat((x, s), 1))
-        return code
+        return self.low(torch.cat((x, s), 1))
 
     def drapes(self, s: Tensor) -> Tensor:
         """Mean drapes G, shape (B, C'), of (β, γ) (B, 14), in coordinates isometric to the vertices [m].

@@ -26,7 +26,6 @@ from refu_core.skeleton import CARRIED, PARENTS
 DEFAULT_GAP = 0.012
 """Room between two parts of a body [m]: for two layers of cloth, each 4 mm off the skin, and some to spare."""
 
-
 FADE = 0.035
 """Skin farther beyond a crease's reach than this isn't held [m]: out there the kept height falls by 1 m per metre."""
 
@@ -273,11 +272,9 @@ def _paths(weights: NDArray[np.float64], of_vertex: NDArray[np.int32]) -> NDArra
 @remembered(4)
 def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArray[np.float64]:
     """Unit normals at the vertices (V, 3) [m], levelled over two rings."""
-    normals, ring = vertex_normals(vertices, mesh.faces), mesh.ring
+    normals, around = vertex_normals(vertices, mesh.faces), mesh.adjacency_matrix()
     for _ in range(2):
-        means = np.zeros_like(normals)
-        np.add.at(means, ring.owner, normals[ring.items])
-        normals = 0.5 * (normals + means / np.diff(ring.start)[:, None])
+        normals = 0.5 * (normals + around @ normals / np.diff(mesh.ring.start)[:, None])
     unit: NDArray[np.float64] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return unit
 

@@ -50,8 +50,8 @@ class Aside:
 
     def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:
         """For a body with a closed `mesh`. No arm moves by more than `farthest` [m], in `rounds` Newton steps."""
-        self._farthest, self._rounds, self._device = farthest, rounds, body.device
-        device = body.device
+        self._farthest, self._rounds = farthest, rounds
+        device = self._device = body.device
         rest, weights, joints = (
             one.double().cpu().numpy() for one in (body.v_template, body.weights, body.joint_template)
         )
@@ -126,14 +126,8 @@ class Aside:
             rotation = rotation.index_copy(0, joints, by @ rotation[joints])
         return skin, rotation
 
-    def middles(self, skin: Tensor) -> Tensor:
-        """The middles of arms, palms, fingers and thumbs of `skin` (V, 3) [m], shape (C, 3)."""
-        return self._means(skin)[len(ARMS) : self._first_cap]
-
     def _means(self, skin: Tensor) -> Tensor:
-        weight = self._weight.to(skin)
-        means: Tensor = embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=weight)
-        return means
+        return embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=self._weight.to(skin))
 
     def _recorded_look(self, mesh: Connectivity, weights: Array) -> Any:
         """A launch that finds box, caps and middles (`_places`), and counts middles near the body (`_n_near`)."""

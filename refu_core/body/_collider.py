@@ -108,8 +108,7 @@ class Collider:
     def _parted(self) -> Tensor:
         """The buffer that holds the result of the last sweeps."""
         work = self.anatomy.memory
-        at: Tensor = work.here if self.settings.smooth_last % 2 == 0 else work.there
-        return at
+        return work.here if self.settings.smooth_last % 2 == 0 else work.there
 
     @cached_property
     def _commands(self) -> dict[str, list[Any]]:

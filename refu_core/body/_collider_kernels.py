@@ -25,7 +25,6 @@ else:
     Stations = wp.types.vector(length=N_STATIONS, dtype=wp.int32)
     StationWeights = wp.types.vector(length=N_STATIONS, dtype=wp.float32)
 
-
 _VISIBLE = wp.constant(1.0e-4)
 """Skin that was moved by more than this counts as moved [m]."""
 

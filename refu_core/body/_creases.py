@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from refu_core.body._model import SmplBody
 from refu_core.mesh import Connectivity
@@ -80,7 +81,7 @@ def find_creases(body: SmplBody, reach: float) -> Creases:
         share = (level - moved[start]) / (moved[end] - moved[start])
         seam = rest[start] * (1 - share)[:, None] + rest[end] * share[:, None]
         picked = _spread_out(seam)
-        near = _falloff(_distances(seam[picked], seam), SPACING)
+        near = _falloff(cdist(seam[picked], seam), SPACING)
         one, on = np.nonzero(near)
         ends = np.concatenate([near[one, on] * (1 - share[on]), near[one, on] * share[on]])
         keys = np.tile(one, 2) * len(rest) + np.concatenate([start[on], end[on]])
@@ -95,7 +96,7 @@ def find_creases(body: SmplBody, reach: float) -> Creases:
         vertex = np.flatnonzero(((rest >= seam.min(0) - reach) & (rest <= seam.max(0) + reach)).all(1))
         along = np.asarray(cKDTree(seam).query(rest[vertex], distance_upper_bound=reach)[0])
         vertex, along = vertex[np.isfinite(along)], along[np.isfinite(along)]
-        distance = _distances(rest[vertex], places)
+        distance = cdist(rest[vertex], places)
         chosen = np.argsort(distance, axis=1, kind="stable")[:, :N_STATIONS]
         chosen = np.pad(chosen, ((0, 0), (0, N_STATIONS - chosen.shape[1])), mode="edge")
         weight = _falloff(np.take_along_axis(distance, chosen, axis=1), _WIDTH)
@@ -116,14 +117,6 @@ def find_creases(body: SmplBody, reach: float) -> Creases:
         station_weight,
         *(np.concatenate(field)[order] for field in zip(*rows, strict=True)),
     )
-
-
-def _distances(points: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of N points (N, 3) from M others (M, 3), shape (N, M); column by column: `norm` takes three times as long."""
-    squared = np.zeros((len(points), len(others)))
-    for here, there in zip(points.T, others.T, strict=True):
-        squared += np.subtract.outer(here, there) ** 2
-    return np.sqrt(squared)
 
 
 def _spread_out(points: NDArray[np.float64]) -> list[int]:

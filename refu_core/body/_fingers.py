@@ -30,29 +30,22 @@ def without_fingers(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any
         return found
     n, parents = tree.shape[1], tree[0].astype(np.int64)
     weights, regressor = np.asarray(arrays["weights"]), np.asarray(arrays["J_regressor"])
-    if (
-        weights.shape[1:] != (n,)
-        or regressor.shape[:1] != (n,)
-        or not (parents[_SHARED:] < np.arange(_SHARED, n)).all()
-    ):
+    if weights.shape[1:] != (n,) or regressor.shape[:1] != (n,) or (parents[_SHARED:] >= np.arange(_SHARED, n)).any():
         return found  # the later check of shapes reports it
     goes_with = np.arange(n)
     for joint in range(_SHARED, n):
         parent = int(parents[joint])
-        above = int(goes_with[parent])
-        goes_with[joint] = _SHARED + _WRISTS.index(parent) if parent in _WRISTS else above
+        goes_with[joint] = _SHARED + _WRISTS.index(parent) if parent in _WRISTS else goes_with[parent]
     share = np.zeros((n, N_JOINTS))
     share[np.arange(n), goes_with] = 1
-    knuckles = [np.flatnonzero(parents == wrist)[np.flatnonzero(parents == wrist) >= _SHARED] for wrist in _WRISTS]
+    knuckles = [_SHARED + np.flatnonzero(parents[_SHARED:] == wrist) for wrist in _WRISTS]
     if not all(map(len, knuckles)):
         return found
     found["weights"] = weights @ share
     found["J_regressor"] = np.concatenate((regressor[:_SHARED], np.stack([regressor[one].mean(0) for one in knuckles])))
     found["kintree_table"] = np.array([[-1, *PARENTS[1:]], range(N_JOINTS)])
-    if "posedirs" in arrays:
-        poses = np.asarray(arrays["posedirs"])
-        kept = 9 * (_SHARED - 1)
-        if poses.ndim == 3 and poses.shape[2] == 9 * (n - 1):
-            rest = np.zeros((*poses.shape[:2], 9 * (N_JOINTS - _SHARED)))
-            found["posedirs"] = np.concatenate((poses[:, :, :kept], rest), axis=2)
+    poses = np.asarray(arrays.get("posedirs"))
+    if poses.ndim == 3 and poses.shape[2] == 9 * (n - 1):
+        rest = np.zeros((*poses.shape[:2], 9 * (N_JOINTS - _SHARED)))
+        found["posedirs"] = np.concatenate((poses[:, :, : 9 * (_SHARED - 1)], rest), axis=2)
     return found

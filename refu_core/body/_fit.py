@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from typing import Any
@@ -17,7 +17,7 @@ from torch import Tensor
 from refu_core._cache import keep, recall
 from refu_core.body._io import load_body
 from refu_core.body._model import BodyArrays, SmplBody
-from refu_core.body._register import ENDS, Array, Registration, derivatives, register, size_of
+from refu_core.body._register import ENDS, Array, Registrar, Registration, derivatives, size_of
 from refu_core.body._rest_pose import require_rest_pose
 from refu_core.body._surface import OnSurface
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -40,7 +40,7 @@ _END_SHARE = 0.1
 _REGRESSED = 400
 """Number of vertices that a joint is regressed from."""
 _VERSION = 2
-"""Version of what `register` computes: results that another version has cached aren't used."""
+"""Version of what `Registrar` computes: results that another version has cached aren't used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +103,8 @@ class BodyFit:
     def text(self) -> str:
         """The quality of the fit, in words."""
         found = self.registration
-        return (
-            f"{1e3 * found.mean_distance:.1f} mm on average, {1e3 * found.far_distance:.1f} mm at the 99th percentile"
-        )
+        mean, far = 1e3 * found.mean_distance, 1e3 * found.far_distance
+        return f"{mean:.1f} mm on average, {far:.1f} mm at the 99th percentile"
 
     @property
     def warnings(self) -> list[str]:
@@ -117,10 +116,7 @@ class BodyFit:
 
     def carried(self, values: NDArray[np.floating]) -> Array:
         """`values` of the body's vertices (N, …), interpolated at the vertices of the built-in mesh (V, …)."""
-        place = self.registration.place
-        faces = self.body.faces.cpu().numpy()
-        there: Array = np.einsum("nk,nk...->n...", place.weight, values.astype(np.float64)[faces[place.face]])
-        return there
+        return self.registration.place.of(values.astype(np.float64), self.body.arrays.faces)
 
     def directions(self) -> Array:
         """What a unit of each beta does to the built-in mesh on this body [m], shape (V, 3, 10)."""
@@ -164,8 +160,7 @@ class BodyFit:
         )
         body = SmplBody(made, name=self.body.name, device=self.body.device, dtype=self.body.dtype)
         known = self.registration
-        place = _corners(made.faces, len(vertices))
-        laid = Registration(vertices, place, known.mean_distance, known.far_distance)
+        laid = replace(known, vertices=vertices, place=_corners(made.faces, len(vertices)))
         return BodyFit(body, laid, fingerprints=(body.fingerprint, self.body.fingerprint))
 
 
@@ -192,28 +187,20 @@ def load_fit(
 ) -> BodyFit:
     """Loads a body and lays the built-in mesh onto it, which takes some seconds for a body not seen before.
 
-    Args:
-        body: a built-in name, the path of an SMPL-layout file, or a loaded body.
-        betas_from: give the same body on the built-in mesh, whatever the file's own mesh is like (`BodyFit.resampled`).
-        device: where its tensors live.
+    With `betas_from` it is the same body on the built-in mesh, whatever its own mesh is like (`BodyFit.resampled`).
 
-    Raises:
-        BodyError: no such body, or one that isn't in metres, upright, in the T-pose, closed (`require_rest_pose`).
+    Raises `BodyError`: no such body, or one that isn't in metres, upright, in the T-pose, closed (`require_rest_pose`).
     """
     loaded = body.to(device=device) if isinstance(body, SmplBody) else load_body(body, device=device)
     source = load_body(REGISTERED)
-    if _same_mesh(loaded, source):
+    # The built-in bodies share one mesh.
+    is_built_in = np.array_equal(loaded.arrays.faces, source.arrays.faces)
+    if is_built_in and any(loaded.fingerprint == load_body(name).fingerprint for name in BUILTIN_BODIES):
         place = _corners(source.arrays.faces, source.n_vertices)
         return BodyFit(loaded, Registration(loaded.arrays.v_template, place, 0.0, 0.0))
     require_rest_pose(loaded, closed=not betas_from)
     found = BodyFit(loaded, _registered(source, loaded))
     return found.resampled() if betas_from else found
-
-
-def _same_mesh(body: SmplBody, source: SmplBody) -> bool:
-    """Whether a body is one of the built-in ones."""
-    shared = body.n_vertices == source.n_vertices and np.array_equal(body.arrays.faces, source.arrays.faces)
-    return shared and any(body.fingerprint == load_body(name).fingerprint for name in BUILTIN_BODIES)
 
 
 def _corners(faces: NDArray[np.int64], n_vertices: int) -> OnSurface:
@@ -225,11 +212,11 @@ def _corners(faces: NDArray[np.int64], n_vertices: int) -> OnSurface:
 
 
 def _registered(source: SmplBody, body: SmplBody) -> Registration:
-    """As `register`, cached from one process to the next."""
+    """As `Registrar` lays it, cached from one process to the next."""
     name = f"fit-{_VERSION}-{source.fingerprint}-{body.fingerprint}"
     known = recall(name, keys=("vertices", "face", "weight", "distances"))
     if known is None or not _makes_sense(known, source, body):
-        made = register(source, body)
+        made = Registrar(source, body).run()
         distances = np.array([made.mean_distance, made.far_distance], np.float32)
         known = {"vertices": made.vertices.astype(np.float32), "face": made.place.face.astype(np.int32)}
         known |= {"weight": made.place.weight.astype(np.float32), "distances": distances}

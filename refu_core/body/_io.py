@@ -27,13 +27,9 @@ _WANTED = "a body model, an .npz or an official .pkl file"
 def load_body(
     source: str | PathLike[str], *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
 ) -> SmplBody:
-    """Loads a body model.
+    """Loads a body model: `male`, `female` or `neutral` (built in), or an SMPL-layout `.npz` or an official `.pkl`.
 
-    Args:
-        source: `male`, `female` or `neutral` (built in), or the path of an SMPL-layout `.npz` or an official `.pkl`. A
-            pickle is read as data only: nothing in it is ever executed.
-        device: where its tensors live.
-        dtype: torch.float32 or torch.float64.
+    A pickle is read as data only: nothing in it is ever executed. `dtype` is torch.float32 or torch.float64.
 
     Raises:
         BodyError: no such body or file, a file that can't be read, or one that isn't an SMPL-layout model.

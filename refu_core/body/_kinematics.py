@@ -26,8 +26,7 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     if is_plain(rotvec):
         flat = rotvec.reshape(-1, 3).contiguous()
         matrices = rotvec.new_empty(*rotvec.shape, 3)
-        if len(flat):
-            _rotate((len(flat),), flat, matrices.view(-1, 3, 3))
+        _rotate((len(flat),), flat, matrices.view(-1, 3, 3))
         return matrices
     angle2 = (rotvec * rotvec).sum(-1)
     small = angle2 < 1e-4 if rotvec.dtype == torch.float32 else angle2 < 1e-8
@@ -42,8 +41,7 @@ def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
     # K² = r rᵀ - |r|² I, one outer product instead of a matrix product.
     outer = rotvec.unsqueeze(-1) * rotvec.unsqueeze(-2)
     eye = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
-    k2: Tensor = outer - angle2[..., None, None] * eye
-    return eye + a[..., None, None] * skew + b[..., None, None] * k2
+    return eye + a[..., None, None] * skew + b[..., None, None] * (outer - angle2[..., None, None] * eye)
 
 
 class RigidTransforms(NamedTuple):
@@ -58,12 +56,8 @@ class RigidTransforms(NamedTuple):
 def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
     """Posed joints [m], shape (B, 24, 3), and the transforms that move rest-pose points with each joint's bone.
 
-    Args:
-        rotations: rotation of each joint relative to its parent, shape (B, 24, 3, 3).
-        joints: rest positions of the joints [m], shape (B, 24, 3), or (1, 24, 3) for bodies of one shape.
-
-    Raises:
-        FrameError: a shape is wrong.
+    `rotations` (B, 24, 3, 3) are relative to the parent joints; `joints` are those at rest [m], shape (B, 24, 3), or
+    (1, 24, 3) for bodies of one shape. Raises `FrameError` for a wrong shape.
     """
     n, batch = len(PARENTS), len(rotations)
     if rotations.shape != (batch, n, 3, 3) or joints.shape not in ((batch, n, 3), (1, n, 3)):
@@ -71,22 +65,18 @@ def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, Rigid
         msg += f"got {tuple(rotations.shape)} and {tuple(joints.shape)}"
         raise FrameError(msg)
     if is_plain(rotations, joints):
-        return _chained(rotations.contiguous(), joints.contiguous())
-    turns, places = [rotations[:, 0]], [joints[:, 0].expand(len(rotations), 3)]
+        turned = torch.empty_like(rotations, memory_format=torch.contiguous_format)
+        translation, posed = rotations.new_empty(2, batch, n, 3)
+        inputs = rotations.contiguous(), joints.contiguous(), _parents(rotations.device)
+        _chain((batch,), *inputs, turned, translation, posed)
+        return posed, RigidTransforms(turned, translation)
+    turns, places = [rotations[:, 0]], [joints[:, 0].expand(batch, 3)]
     for joint, parent in enumerate(PARENTS[1:], start=1):
         bone = joints[:, joint] - joints[:, parent]
         turns.append(turns[parent] @ rotations[:, joint])
         places.append(places[parent] + (turns[parent] @ bone[..., None])[..., 0])
-    rotation, posed = torch.stack(turns, 1), torch.stack(places, 1)
-    return posed, RigidTransforms(rotation, posed - (rotation @ joints.unsqueeze(-1)).squeeze(-1))
-
-
-def _chained(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
-    turned = torch.empty_like(rotations)
-    translation, posed = rotations.new_empty(2, *rotations.shape[:3])
-    if len(rotations):
-        _chain((len(rotations),), rotations, joints, _parents(rotations.device), turned, translation, posed)
-    return posed, RigidTransforms(turned, translation)
+    turned, posed = torch.stack(turns, 1), torch.stack(places, 1)
+    return posed, RigidTransforms(turned, posed - (turned @ joints.unsqueeze(-1)).squeeze(-1))
 
 
 @cache

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from refu_core.body._fingers import without_fingers
-from refu_core.body._hints import n_rows, of_keys, of_shape, of_tree
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
 from refu_core.errors import BodyError, FrameError, require_type
@@ -24,6 +24,8 @@ N_POSE_FEATURES = 9 * (N_JOINTS - 1)
 _TENSOR = "{} as a torch.Tensor, such as torch.as_tensor(array) gives"
 _LARGEST = 1e6
 """No model has larger numbers, and products of much larger ones are infinite in float32."""
+_OTHERS = {5: "FLAME's, a head", 16: "MANO's, a hand", 33: "SMAL's, an animal", 35: "SMAL's, an animal", 75: "SUPR's"}
+"""Models of the same keys, by their number of joints."""
 
 
 class BodyOutput(NamedTuple):
@@ -68,7 +70,7 @@ class BodyArrays:
         """Reads the keys of SMPL files (`f`, `J_regressor`, `kintree_table`, …); raises `BodyError`."""
         missing = sorted({"v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs"} - set(data))
         if missing:
-            msg = f"{source}: not an SMPL-layout model, it lacks {', '.join(missing)}{of_keys(data, missing)}"
+            msg = f"{source}: not an SMPL-layout model, it lacks {', '.join(missing)}{_keys_hint(data, missing)}"
             raise BodyError(msg)
 
         def numbers(key: str) -> NDArray[np.float64]:
@@ -85,17 +87,19 @@ class BodyArrays:
         read = {key: numbers(key) for key in ("weights", "J_regressor", "kintree_table", "posedirs") if key in data}
         read = without_fingers(read)
         v_template = numbers("v_template")
-        n = n_rows(v_template.shape) if v_template.ndim == 2 else 0
+        n = _n_rows(v_template.shape) if v_template.ndim == 2 else 0
         parents = read["kintree_table"]
         # The root's parent is stored as 2**32 - 1 or -1.
         if parents.shape != (2, N_JOINTS) or tuple(parents[0, 1:].tolist()) != PARENTS[1:]:
             msg = f"{source}: kintree_table must be the tree of SMPL's {N_JOINTS} joints, or of SMPL-H's or SMPL-X's, "
-            msg += f"got the shape {parents.shape}{of_tree(parents.shape)}"
+            msg += f"got the shape {parents.shape}{_tree_hint(parents.shape)}"
             raise BodyError(msg)
 
         def require(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
             if array.shape != shape or not n:
-                msg = f"{source}: {name} must have the shape {shape}, got {array.shape}{of_shape(array.shape, shape)}"
+                msg = (
+                    f"{source}: {name} must have the shape {shape}, got {array.shape}{_shape_hint(array.shape, shape)}"
+                )
                 raise BodyError(msg)
 
         require("v_template", v_template, (n, 3))
@@ -104,7 +108,7 @@ class BodyArrays:
         if n_shapes < N_BETAS:
             raise BodyError(f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}")
         require("shapedirs", shapedirs, (n, 3, n_shapes))
-        require("f", faces, (n_rows(faces.shape), 3))
+        require("f", faces, (_n_rows(faces.shape), 3))
         require("weights", read["weights"], (n, N_JOINTS))
         require("J_regressor", read["J_regressor"], (N_JOINTS, n))
         posedirs = read["posedirs"] if "posedirs" in read and read["posedirs"].any() else None
@@ -131,6 +135,40 @@ class BodyArrays:
         return arrays
 
 
+def _keys_hint(there: Collection[str], missing: list[str]) -> str:
+    """The hint for a file that has the keys `there` and lacks `missing`; empty if there is none."""
+    if "skin_template_v" in there:
+        return ": it is SKEL's, whose bones aren't SMPL's joints; give SMPL's own file"
+    if missing == ["f"] and "faces" in there:
+        return ": SMPL's files call their faces f"
+    if "weights" in missing and "shapedirs" in missing:
+        return ": a mesh or a scan has no joints and no shapes; fit SMPL to it and give SMPL's own file"
+    return ""
+
+
+def _tree_hint(shape: tuple[int, ...]) -> str:
+    """The hint for a `kintree_table` of a wrong shape; empty if there is none."""
+    if len(shape) == 2 and shape[1] == 2:
+        return ": transpose it"
+    other = _OTHERS.get(shape[1], "") if len(shape) == 2 else ""
+    return f": the file is {other}; give SMPL's own file" if other else ""
+
+
+def _n_rows(shape: tuple[int, ...]) -> int:
+    """How many triples an array (N, 3) holds, or one that was transposed by mistake."""
+    return shape[1] if len(shape) == 2 and shape[0] == 3 != shape[1] else shape[0]
+
+
+def _shape_hint(shape: tuple[int, ...], wanted: tuple[int, ...]) -> str:
+    """The hint for an array of another shape than `wanted`; empty if there is none."""
+    flat = (wanted[0] * wanted[1], *wanted[2:])
+    if shape == wanted[::-1]:
+        return ": transpose it"
+    if shape == flat:
+        return f": reshape it to {wanted}"
+    return f": transpose it, and reshape it to {wanted}" if shape == flat[::-1] else ""
+
+
 class SmplBody:
     """An SMPL-layout body: batched, differentiable, float32 or float64, on any device.
 
@@ -142,7 +180,8 @@ class SmplBody:
     ) -> None:
         self.name = name
         """What the body was loaded as: a built-in name or a file's stem."""
-        self._arrays = arrays
+        self.arrays = arrays
+        """As in its file, in float64; those of built-in bodies are shared and read-only."""
         self.device = torch.device(device)
         self.dtype = dtype
 
@@ -179,11 +218,6 @@ class SmplBody:
         return f"SmplBody({self.name!r}, {self.n_vertices} vertices, {self.dtype}, {self.device})"
 
     @property
-    def arrays(self) -> BodyArrays:
-        """The model's arrays as in its file, in float64; those of built-in bodies are shared and read-only."""
-        return self._arrays
-
-    @property
     def n_vertices(self) -> int:
         """Number of vertices V."""
         return len(self.v_template)
@@ -192,20 +226,19 @@ class SmplBody:
     def fingerprint(self) -> str:
         """Hash of the model's arrays (16 hexadecimal digits), by which weights name the body they were trained on."""
         digest = hashlib.sha256()
-        for entry in fields(self._arrays):
-            array = getattr(self._arrays, entry.name)
+        for entry in fields(self.arrays):
+            array = getattr(self.arrays, entry.name)
             if array is not None:
                 digest.update(np.ascontiguousarray(array, dtype="<i4" if entry.name == "faces" else "<f4").tobytes())
         return digest.hexdigest()[:16]
 
     def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> SmplBody:
         """The same body on another device or in another precision."""
-        return SmplBody(self._arrays, name=self.name, device=device or self.device, dtype=dtype or self.dtype)
+        return SmplBody(self.arrays, name=self.name, device=device or self.device, dtype=dtype or self.dtype)
 
     def _batch(self, name: str, value: ArrayLike | Tensor, width: tuple[int, ...]) -> Tensor:
         tensor = _tensor(name, value, self.device).to(self.dtype)
-        size = int(np.prod(width))
-        if tensor.shape[1:] not in (width, (size,)) or tensor.ndim < 2:
+        if tensor.shape[1:] not in (width, (math.prod(width),)) or tensor.ndim < 2:
             raise FrameError(f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}")
         return tensor.reshape(-1, *width)
 
@@ -231,15 +264,12 @@ class SmplBody:
         betas: ArrayLike | Tensor | None = None,
         transl: ArrayLike | Tensor | None = None,
     ) -> BodyOutput:
-        """Poses a batch of bodies.
+        """Poses a batch of bodies. Raises `FrameError` for a wrong shape.
 
         Args:
             pose: rotation vectors relative to the parent joint [rad], shape (B, 24, 3) or (B, 72).
             betas: shape coefficients, (B, 10) or (1, 10); zeros if not given.
             transl: added to vertices and joints, in its own precision [m], (B, 3) or (1, 3).
-
-        Raises:
-            FrameError: a shape is wrong.
         """
         theta = self._batch("pose", pose, (N_JOINTS, 3))
         batch = len(theta)
@@ -269,8 +299,7 @@ class SmplBody:
         joints, transforms = forward_kinematics(rotations, shape.joints)
         vertices = shape.vertices
         if self._posedirs is not None:
-            eye = torch.eye(3, dtype=self.dtype, device=self.device)
-            feature = (rotations[:, 1:] - eye).flatten(1)
+            feature = (rotations[:, 1:] - torch.eye(3, dtype=self.dtype, device=self.device)).flatten(1)
             vertices = vertices + (feature @ self._posedirs.T).view(len(pose), vertices.shape[1], 3)
         return BodyOutput(self._skinning(vertices, transforms), joints, transforms)
 

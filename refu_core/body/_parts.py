@@ -39,14 +39,10 @@ ARMS: tuple[Joints, Joints] = (
 LEGS: tuple[Joints, Joints] = (joints_of("left_thigh", "left_shin"), joints_of("right_thigh", "right_shin"))
 """Left and right."""
 
-
-def _other_side(name: str) -> str:
-    sides = {"left": "right", "right": "left"}
-    side, _, rest = name.partition("_")
-    return f"{sides[side]}_{rest}" if side in sides else name
-
-
-MIRRORED_JOINTS: Joints = tuple(JOINT_NAMES.index(_other_side(name)) for name in JOINT_NAMES)
+_SIDES = {"left": "right", "right": "left"}
+MIRRORED_JOINTS: Joints = tuple(
+    JOINT_NAMES.index("_".join(_SIDES.get(word, word) for word in name.split("_"))) for name in JOINT_NAMES
+)
 """The joint on the other side of each one."""
 
 

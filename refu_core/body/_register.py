@@ -74,7 +74,6 @@ _LOOKED_AT = tuple(
 )
 ENDS = (*joints_of("head"), 7, 8, 10, 11, 20, 21, 22, 23)
 
-
 _ALONG = 0.05
 """How much a gap along the surface counts, relative to one across it: closest points slide along the surface."""
 _SEEN = 0.01
@@ -113,24 +112,20 @@ def size_of(body: SmplBody) -> float:
     return float(tall / np.clip(tall, *RegistrationSettings.heights))
 
 
-def register(source: SmplBody, target: SmplBody) -> Registration:
+class Registrar:
     """Lays the mesh of `source` onto the rest surface of `target`, in some seconds.
 
     First the source's shape, pose and place are fitted; then each vertex moves to the closest point, held back less
     and less by its neighbours. Children and giants are registered at an adult's height.
     """
-    return _Registrar(source, target).run()
 
-
-class _Registrar:
     def __init__(self, source: SmplBody, target: SmplBody) -> None:
         self.how = RegistrationSettings()
         self.source = source.to(device="cpu", dtype=torch.float64)
         self.target = target.to(device="cpu", dtype=torch.float64)
         self.mesh = Connectivity.of(source.faces.cpu().numpy(), source.n_vertices)
         self.size = size_of(target)
-        at_size = self.target.v_template.numpy() / self.size
-        self.surface = Surface(at_size, target.faces.cpu().numpy().astype(np.int32))
+        self.surface = Surface(self.target.v_template.numpy() / self.size, target.faces.cpu().numpy().astype(np.int32))
         self.joints = self.target.joint_template.numpy() / self.size
         self.is_end = self.source.weights[:, list(ENDS)].sum(1).numpy() > 0.5
 
@@ -140,8 +135,7 @@ class _Registrar:
         place = self.surface.closest(vertices)
         there = np.linalg.norm(self.surface.at(place) - vertices, axis=1)[~self.is_end]
         own = Surface(vertices, self.mesh.faces)
-        is_end = self.target.weights[:, list(ENDS)].sum(1).numpy() > 0.5
-        points = self.surface.vertices[~is_end]
+        points = self.surface.vertices[self.target.weights[:, list(ENDS)].sum(1).numpy() <= 0.5]
         back = np.linalg.norm(own.at(own.closest(points)) - points, axis=1)
         both = self.size * np.concatenate((there, back))
         return Registration(self.size * vertices, place, float(both.mean()), float(np.percentile(both, 99)))
@@ -176,11 +170,8 @@ class _Registrar:
                 (linear.vertices[mine].reshape(-1, len(state)), np.repeat(_ALONG * weight, 3)),
                 (linear.joints[_LOOKED_AT, :].reshape(-1, len(state)), how.joint_spread**-2),
             ]
-            off = [
-                (gap * self.surface.normals[theirs]).sum(1),
-                gap.ravel(),
-                (joints - self.joints)[list(_LOOKED_AT)].ravel(),
-            ]
+            across, off_joints = (gap * self.surface.normals[theirs]).sum(1), (joints - self.joints)[list(_LOOKED_AT)]
+            off = [across, gap.ravel(), off_joints.ravel()]
             normal = np.diag(prior) + sum(a.T @ (np.reshape(w, (-1, 1)) * a) for a, w in rows)
             slope = prior * state + sum(a.T @ (w * r) for (a, w), r in zip(rows, off, strict=True))
             state = state - np.linalg.solve(normal, slope)

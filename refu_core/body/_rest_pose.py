@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 
 from refu_core.body._kinematics import JOINT_NAMES
 from refu_core.body._model import BodyArrays, SmplBody
-from refu_core.body._segments import SOFTNESS, segment_of_face, shares
+from refu_core.body._parts import part_of_faces
+from refu_core.body._segments import SOFTNESS
 from refu_core.errors import BodyError, MeshError
 from refu_core.mesh import Connectivity
 
@@ -37,13 +38,12 @@ _WANTED = "wanted metres, y up, facing +z, the subject's left at +x, in the T-po
 def require_rest_pose(body: SmplBody, *, closed: bool = True) -> None:
     """Checks that the mean shape stands as expected, with its faces turned outward, and is closed if `closed`.
 
-    Raises:
-        BodyError: it has other units or axes, is mirrored, not in the T-pose, open or turned inside out, or its joints
-            are elsewhere.
+    Raises `BodyError` if it has other units or axes, is mirrored, not in the T-pose, open or turned inside out, or if
+    its joints are elsewhere.
     """
     joints = body.arrays.joint_regressor @ body.arrays.v_template
     fault = _fault(body.arrays.v_template, joints) or _misled(body.arrays, joints)
-    fault = fault or _lacking(body.arrays) or _loose(body.arrays, joints)
+    fault = fault or _lacking(body) or _loose(body.arrays, joints)
     if not fault:
         try:
             mesh = Connectivity.of(body.faces.cpu().numpy(), body.n_vertices)
@@ -98,15 +98,17 @@ def _misled(arrays: BodyArrays, joints: NDArray[np.float64]) -> str:
     return ""
 
 
-def _lacking(arrays: BodyArrays) -> str:
+def _lacking(body: SmplBody) -> str:
     """What is wrong if vertices or segments lack faces, or directions aren't in metres; empty if nothing is."""
+    arrays = body.arrays
     tall = float(np.ptp(arrays.v_template[:, 1]))
     if n_unused := len(arrays.v_template) - len(np.unique(arrays.faces)):
         return f"{n_unused} of {len(arrays.v_template)} vertices belong to no face: leave them out"
-    there = segment_of_face(arrays.faces, shares(arrays.weights))
-    for k, ((part, *_), _) in enumerate(SOFTNESS):
+    parts = [joints for joints, _ in SOFTNESS]
+    there = part_of_faces(body.weights.cpu(), body.faces.cpu(), parts)
+    for k, joints in enumerate(parts):
         if k not in there:
-            return f"no face follows its {JOINT_NAMES[part]} for the most part: the mesh lacks it, or is too coarse"
+            return f"no face follows its {JOINT_NAMES[joints[0]]} for the most part: the mesh lacks it, or is coarse"
     for name in ("shapedirs", "posedirs"):
         found = getattr(arrays, name)
         if found is not None and (far := float(np.abs(found).max())) > _FARTHEST * tall:
@@ -132,8 +134,7 @@ def _fault(vertices: NDArray[np.float64], joints: NDArray[np.float64]) -> str:
     ways = {name: _axis(way) for name, way in (("up", up), ("left", left), ("front", forward))}
     if tuple(ways.values()) != ("+y", "+x", "+z"):
         told = ", ".join(f"{name} is {way}" for name, way in ways.items())
-        handed = np.dot(np.cross(up, forward), left)
-        if handed < 0:
+        if np.cross(up, forward) @ left < 0:
             return f"it is mirrored ({told}): {_WANTED}; negate one coordinate, or exchange left and right"
         return f"it stands otherwise ({told}): {_WANTED}; turn v_template, shapedirs and posedirs"
     for side, out in (("left", 1), ("right", -1)):

@@ -53,18 +53,12 @@ def shares(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([weights[:, list(joints)].sum(axis=1) for joints, _ in SOFTNESS], axis=1)
 
 
-def segment_of_face(faces: NDArray[np.integer], share: NDArray[np.float64]) -> NDArray[np.intp]:
-    """The segment of each face, shape (F,)."""
-    found: NDArray[np.intp] = share[faces].sum(axis=1).argmax(axis=1)
-    return found
-
-
 @remembered(4)
 def cut(faces: NDArray[np.int32], share: NDArray[np.float64]) -> Solids:
     """Cuts a mesh of faces (F, 3) by the `share` that each vertex has in each segment, (V, K)."""
     n_vertices, n_segments = share.shape
     of_vertex = share.argmax(axis=1).astype(np.int32)
-    of_face = segment_of_face(faces, share)
+    of_face = share[faces].sum(axis=1).argmax(axis=1)
     closed, loops = [], []
     n_points = n_vertices
     for segment in range(n_segments):

@@ -16,7 +16,6 @@ from refu_core.errors import MeshError
 _MIN_DETERMINANT = 1e-4
 """Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
 
-
 _skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transform, wp.int32, wp.vec3))
 
 
@@ -73,9 +72,8 @@ class Skinning:
             return apply_transforms(points, blend_transforms(self._weights, transforms))
         points, stacked = points.contiguous(), _stacked(transforms)
         posed = points.new_empty(batch, n, 3)
-        if batch:
-            n_strips, each = strips(n, posed.device)
-            _skin((batch, n_strips), points, *self._by_joint, stacked, each, posed)
+        n_strips, each = strips(n, posed.device)
+        _skin((batch, n_strips), points, *self._by_joint, stacked, each, posed)
         return posed
 
 

@@ -21,6 +21,10 @@ class OnSurface(NamedTuple):
     weight: NDArray[np.float64]
     """Barycentrics at the face's vertices 0, 1, 2; rows sum to one, shape (N, 3)."""
 
+    def of(self, values: NDArray[Any], faces: NDArray[np.integer]) -> NDArray[np.float64]:
+        """`values` (V, …) of the vertices of a surface of these `faces` (F, 3), interpolated at the points (N, …)."""
+        return np.asarray(np.einsum("nk,nk...->n...", self.weight, values[faces[self.face]]))
+
 
 class Surface:
     """A triangle mesh that finds its points closest to others, on the CPU."""
@@ -43,9 +47,7 @@ class Surface:
 
     def at(self, found: OnSurface, values: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         """`values` of the vertices (V, …), by default their places [m], interpolated at surface points (N, …)."""
-        values = self.vertices if values is None else values
-        there: Any = np.einsum("nk,nk...->n...", found.weight, values[self.faces[found.face]])
-        return np.asarray(there)
+        return found.of(self.vertices if values is None else values, self.faces)
 
     def heights(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Signed distances (N,) of points near the surface [m], and the unit directions away from it (N, 3)."""

@@ -59,7 +59,7 @@ class SkinBelow:
 
     def __call__(self, shift: Tensor) -> Tensor:
         """How far cloth moves [m], shape (B, N, 3), with skin that moves by `shift` (B, V, 3). Differentiable."""
-        if is_plain(shift, self.weight) and len(shift):
+        if is_plain(shift, self.weight):
             n_strips, each = strips(len(self.vertex), shift.device)
             cloth = shift.new_empty(len(shift), len(self.vertex), 3)
             _follow((len(shift), n_strips), self.vertex, self.weight, shift.contiguous(), each, cloth)

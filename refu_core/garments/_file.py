@@ -52,26 +52,18 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 def load_garment(
     garment: str | os.PathLike[str], *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
 ) -> GarmentTemplate:
-    """Loads a garment.
+    """Loads a garment that ships or is in the user's folder (`garment_files`), by its name, or from an `.npz`.
 
-    Args:
-        garment: name of one that ships or is in the user's folder (`garment_files`), or the path of an `.npz` as
-            `refu_core/assets/README.md` describes it. `garment_kilt.npz` and `kilt.npz` are the garment `kilt`.
-        device: torch device.
-        dtype: of all tensors but the faces.
-
-    Raises:
-        GarmentError: there is no such garment, or the file isn't one.
+    `refu_core/assets/README.md` describes such files. `garment_kilt.npz` and `kilt.npz` are the garment `kilt`. `dtype`
+    is that of all tensors but the faces. Raises `GarmentError` if there is no such garment, or the file isn't one.
     """
+    require_type(garment, (str, os.PathLike), "a garment's name or the path of an .npz", error=GarmentError)
+    path = Path(garment)
     if isinstance(garment, str) and not garment.endswith(".npz"):
         known = garment_files()
         if garment not in known:
             raise GarmentError(_unknown(garment, list(known)))
-        return _read(known[garment], device, dtype)
-    try:
-        path = Path(garment)
-    except TypeError as error:
-        raise GarmentError(f"a garment is a name or the path of an .npz, got {type(garment).__name__}") from error
+        path = known[garment]
     return _read(path, device, dtype)
 
 
@@ -173,8 +165,7 @@ def _name_in(path: Path) -> str:
 def _rounded(tensor: torch.Tensor, bits: int) -> NDArray[np.float32]:
     """Rounds to multiples of 2^-bits: the insignificant bits become zeros, which compress to nothing."""
     scale = float(1 << bits)
-    found: NDArray[np.float32] = (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
-    return found
+    return (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
@@ -189,13 +180,8 @@ def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
     if str(data["body"]) not in BUILTIN_BODIES:
         raise ValueError(f"it is cut for the body {str(data['body'])[:80]!r}: wanted {', '.join(BUILTIN_BODIES)}")
     n = len(data["v_template"]) if data["v_template"].ndim else 0
-    shapes = {
-        "v_template": (n, 3),
-        "weights": (n, N_JOINTS),
-        "shapedirs": (n, 3, N_BETAS),
-        "styledirs": (n, 3, N_STYLES),
-    }
-    for key, shape in shapes.items():
+    shapes = {"weights": (n, N_JOINTS), "shapedirs": (n, 3, N_BETAS), "styledirs": (n, 3, N_STYLES)}
+    for key, shape in {"v_template": (n, 3), **shapes}.items():
         if key in data and (data[key].shape != shape or not n or not np.isfinite(data[key]).all()):
             raise ValueError(f"{key}: wanted finite numbers of the shape {shape}, got {data[key].shape}")
     if not (data["weights"] >= 0).all() or np.abs(data["weights"].sum(1) - 1).max() > 1e-3:

@@ -93,8 +93,7 @@ class _Carrier:
     def __call__(self, values: Array) -> Array:
         """`values` of the skin's vertices (V, …), carried over to the garment's (N, …)."""
         there = self._attach @ values.reshape(len(values), -1)
-        levelled: Array = self._solve(self._hold[:, None] * there)
-        return levelled.reshape(-1, *values.shape[1:])
+        return self._solve(self._hold[:, None] * there).reshape(-1, *values.shape[1:])
 
 
 def _on_own_side(vertices: Array, own_side: Array, middle: float) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,9 +29,7 @@ class Crossings(NamedTuple):
     """Which edges of the body face pierce the face, shape (K, 3)."""
 
 
-def as_vertices(name: str, values: Any) -> NDArray[np.float32]:
-    """`values` (numpy or torch) as a contiguous, finite float32 array, shape (N, 3)."""
-    return as_points(name, values, dtype=np.float32)
+as_vertices = partial(as_points, dtype=np.float32)
 
 
 class Triangles:
@@ -43,8 +42,9 @@ class Triangles:
         """
         self.faces = faces
         order = grouped(vertices[faces].mean(axis=1)) if len(faces) else np.empty(0, np.int64)
-        self.blocks = torch.as_tensor(faces[order])
-        self.numbers = torch.as_tensor(order.astype(np.int32))
+        blocks, numbers = torch.as_tensor(faces[order]), torch.as_tensor(order.astype(np.int32))
+        self.arrays = as_warp(blocks, wp.vec3i), as_warp(numbers, wp.int32)
+        """The faces in blocks, and their numbers."""
 
 
 def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles, *, is_body: bool = False) -> Crossings:
@@ -63,18 +63,11 @@ def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles,
         wp.launch(
             intersect_kernel,
             dim=-(-n_faces // int(BLOCK)),
-            inputs=[
-                mesh_id,
-                as_warp(points, wp.vec3),
-                as_warp(triangles.blocks, wp.vec3i),
-                as_warp(triangles.numbers, wp.int32),
-                is_body,
-            ],
+            inputs=[mesh_id, as_warp(points, wp.vec3), *triangles.arrays, is_body],
             outputs=[as_warp(count, wp.int32), as_warp(found, wp.vec3i)],
             device="cpu",
         )
-        n = int(count)
-        if n <= room:
+        if (n := int(count)) <= room:
             break
         room = n  # too little room: once more, with room for all
     rows = found[:n].numpy()

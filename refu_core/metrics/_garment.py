@@ -119,8 +119,7 @@ class FoldBands:
     """
 
     def __init__(self, mesh: Connectivity) -> None:
-        half = 0.5 * mesh.uniform_laplacian()
-        self._sweep = sparse.csr_array(sparse.eye_array(mesh.n_vertices) - half)
+        self._sweep = sparse.csr_array(sparse.eye_array(mesh.n_vertices) - 0.5 * mesh.uniform_laplacian())
 
     def split(self, vertices: Any) -> NDArray[np.float64]:
         """The bands of arrays (V, ...) over the vertices, finest first, and what is left: (5, V, ...). They add up."""
@@ -163,11 +162,8 @@ class GarmentMetrics:
         region = np.ones(n, np.bool_) if resolved is None else np.asarray(resolved, dtype=np.bool_)
         shapes = {region.shape, collisions.inside.shape}
         if shapes != {(n,)} or (target is not None and target.shape != garment.shape) or self.faces.max() >= n:
-            msg = (
-                f"truth, resolved and collisions must belong to the garment's {n} vertices, got shapes "
-                f"{None if target is None else target.shape}, {region.shape}, {collisions.inside.shape}"
-            )
-            raise MeshError(msg)
+            got = f"{None if target is None else target.shape}, {region.shape}, {collisions.inside.shape}"
+            raise MeshError(f"truth, resolved and collisions must belong to the garment's {n} vertices, got {got}")
         errors = laplacians = folds = None
         if target is not None:
             errors = np.linalg.norm(garment.astype(np.float64) - target, axis=1)

@@ -53,8 +53,7 @@ class SelfContact:
         away: NDArray[Any] = np.linalg.norm(contact.at(contact.closest(places)) - places, axis=1)
         closest = Surface(vertices, self._body_faces).closest(places).face
         is_within = _are_inside(Winding(torch.from_numpy(self._body_faces)), self.vertices, queries)
-        near: NDArray[np.bool_] = (away <= distance) | (np.isin(closest, self.faces) & is_within)
-        return near
+        return (away <= distance) | (np.isin(closest, self.faces) & is_within)
 
 
 class SelfContactDetector:
@@ -80,9 +79,8 @@ class SelfContactDetector:
     def detect(self, body_vertices: Any) -> SelfContact:
         """The self-contact of a posed body, `body_vertices` [m], shape (V, 3). Raises `MeshError` for other shapes."""
         vertices = as_vertices("body_vertices", body_vertices)
-        if len(vertices) != len(self._rest_buried):
-            msg = f"body_vertices must have the rest pose's shape ({len(self._rest_buried)}, 3), got {vertices.shape}"
-            raise MeshError(msg)
+        if (n := len(self._rest_buried)) != len(vertices):
+            raise MeshError(f"body_vertices must have the rest pose's shape ({n}, 3), got {vertices.shape}")
         pairs, buried = self._contacts(vertices)
         pairs = pairs[~np.isin(self._keys(pairs), self._rest_pairs)]
         # Skin enters another part by crossing its skin: what seems buried without that is a fold that nearly touches.
@@ -102,11 +100,9 @@ class SelfContactDetector:
         return self._sheet.with_itself(), _are_inside(self._winding, vertices, above)
 
     def _keys(self, pairs: NDArray[np.int32]) -> NDArray[np.int64]:
-        keys: NDArray[np.int64] = pairs[:, 0].astype(np.int64) * len(self._faces) + pairs[:, 1]
-        return keys
+        return pairs[:, 0].astype(np.int64) * len(self._faces) + pairs[:, 1]
 
 
 def _are_inside(winding: Winding, vertices: NDArray[np.float32], points: NDArray[np.float32]) -> NDArray[np.bool_]:
     winding.update(torch.from_numpy(vertices))
-    inside: NDArray[np.bool_] = (winding(torch.from_numpy(points)) > 0).numpy()
-    return inside
+    return (winding(torch.from_numpy(points)) > 0).numpy()

@@ -59,5 +59,4 @@ class Clearance:
         require_known(name, self._rings)
         ring = self._rings[name]
         points = as_points("the garment's vertices", vertices, len(ring.start) - 1, dtype=np.float32)
-        distance: NDArray[np.float32] = self._sdf.clipped(torch.from_numpy(points), ring).distance.numpy()
-        return distance
+        return self._sdf.clipped(torch.from_numpy(points), ring).distance.numpy()

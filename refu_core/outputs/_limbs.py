@@ -51,8 +51,7 @@ class LimbContacts:
     def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
         """For garments on a body, on the CPU."""
         self._faces = {name: garment.faces.cpu().numpy() for name, garment in garments.items()}
-        n = body.n_vertices
-        self._points, self._shift = memory(2, n, 3)
+        self._points, self._shift = memory(2, body.n_vertices, 3)
         self._points.copy_(body.v_template.detach())
         part = part_of_faces(body.weights.cpu(), body.faces.cpu(), list(SEGMENTS.values())).numpy()
         faces = body.faces.cpu().numpy().astype(np.int32)

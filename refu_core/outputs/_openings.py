@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,16 +133,13 @@ def _longest_run(mask: NDArray[np.bool_], length: NDArray[np.float64]) -> NDArra
         return np.flatnonzero(mask)
     turn = int(np.flatnonzero(~mask)[0])
     rows = np.roll(np.arange(len(mask)), -turn)
-    starts = np.flatnonzero(np.diff(mask[rows].astype(np.int8), prepend=0) == 1)
-    ends = np.flatnonzero(np.diff(mask[rows].astype(np.int8), append=0) == -1)
-    runs: Sequence[NDArray[np.intp]] = [rows[a : b + 1] for a, b in zip(starts, ends, strict=True)]
-    return max(runs, key=lambda run: float(length[run].sum()))
+    runs = np.split(rows, np.flatnonzero(np.diff(mask[rows])) + 1)
+    return max((run for run in runs if mask[run[0]]), key=lambda run: float(length[run].sum()))
 
 
 def _called(ring: Ring, rest: NDArray[np.float64], weights: NDArray[np.float64]) -> str:
     """The opening's name, by the joints that move the rim and the way it opens; empty if it isn't a known one."""
-    area = newell(rest[ring.vertices])
-    normal = area / max(float(np.linalg.norm(area)), 1e-12)
+    normal = _unit(newell(rest[ring.vertices]))
     of_joint = ring.shares @ weights[ring.vertices]
     for side, arm, collar, outward in (("left", ARMS[0], 13, 1.0), ("right", ARMS[1], 14, -1.0)):
         moved = of_joint[list(arm)].sum()
@@ -217,8 +214,7 @@ class Openings:
 def _along(ring: Ring, rest: NDArray[np.float64]) -> NDArray[np.float64]:
     """Weights (K,) with which the rim's vertices add up to the opening's x, in the rest pose and as the cloth moves."""
     points = rest[ring.vertices]
-    area = newell(points)
-    normal = area / max(float(np.linalg.norm(area)), 1e-12)
+    normal = _unit(newell(points))
     wanted = np.array([1.0, 0, 0]) if abs(normal[0]) < 0.7 else np.array([0, 0, 1.0])
     wanted -= (wanted @ normal) * normal
     middle = points - ring.shares @ points

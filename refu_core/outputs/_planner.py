@@ -19,7 +19,7 @@ from refu_core.errors import MeshError
 from refu_core.frames import SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity, as_points, rim_of, symmetric_solver, vertex_areas
-from refu_core.outputs._simplify import simplify
+from refu_core.outputs._simplify import CoarseSheet
 from refu_core.realtime import GarmentPipeline
 from refu_core.skeleton import posed
 
@@ -248,7 +248,7 @@ def _prepared(
     known = recall(name, keys=keys)
     if known is None:
         shapes = rest[None] if worn is None else np.concatenate((rest[None], worn()))
-        kept, sheet = simplify(shapes, garment.mesh.faces, max_triangles)
+        kept, sheet = CoarseSheet(shapes, garment.mesh.faces).collapsed(max_triangles)
         take = fitted_means(shapes, garment.mesh, kept, sheet)
         known = dict(zip(keys, (kept, sheet, take.data, take.indices, take.indptr), strict=True))
         keep(name, known)

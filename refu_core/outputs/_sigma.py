@@ -237,8 +237,7 @@ def _input_variance(
     n = len(joints)
     if covariance.ndim == 3:
         covariance = block_diag(*covariance)
-    blocks = covariance.reshape(n, 3, n, 3)
-    spread = np.einsum("aij,ajbk,blk->abil", turn, blocks, turn, optimize=True)
+    spread = np.einsum("aij,ajbk,blk->abil", turn, covariance.reshape(n, 3, n, 3), turn, optimize=True)
     trace = np.trace(spread, axis1=2, axis2=3)
     flat = arm.reshape(len(arm), -1)
     # tr([a]× S [b]×ᵀ) = (a·b) tr S - bᵀ S a

@@ -27,25 +27,15 @@ _LONGEST = 8
 Vector = tuple[float, float, float]
 
 
-def simplify(
-    shapes: NDArray[np.float64], faces: NDArray[np.int32], most: int
-) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Collapses edges until twice the faces and a wall along the boundary are at most `most` triangles, if possible.
+class CoarseSheet:
+    """A mesh with `faces` (F, 3) in several `shapes` (P, V, 3) [m]; no collapse turns a triangle over in the first."""
 
-    `shapes` (P, V, 3) [m] are those of one mesh with `faces` (F, 3); no collapse turns a triangle over in the first.
-    Returns the vertices that are kept, (K,), and faces that index these, (G, 3).
-    """
-    return _Sheet(shapes, faces).collapsed(most)
-
-
-class _Sheet:
     def __init__(self, shapes: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
         mesh = Connectivity.of(faces, shapes.shape[1])
         self.places: list[Vector] = [tuple(row) for row in shapes[0].tolist()]
         self.shapes = np.ascontiguousarray(shapes.transpose(1, 0, 2))
         x, y, z = np.moveaxis(self.shapes, -1, 0)
-        one = np.ones_like(x)
-        terms = (x * x, 2 * x * y, 2 * x * z, 2 * x, y * y, 2 * y * z, 2 * y, z * z, 2 * z, one)
+        terms = (x * x, 2 * x * y, 2 * x * z, 2 * x, y * y, 2 * y * z, 2 * y, z * z, 2 * z, np.ones_like(x))
         self.terms = np.stack(terms, -1).reshape(len(self.shapes), -1)
         """What a quadric is multiplied by to get its value at each vertex, shape (V, 10 P)."""
         self.faces: dict[int, tuple[int, int, int]] = dict(enumerate(map(tuple, faces.tolist())))
@@ -69,6 +59,10 @@ class _Sheet:
         self.areas = np.mean(areas, axis=0)
 
     def collapsed(self, most: int) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+        """Collapses edges until twice the faces and a wall along the boundary are at most `most` triangles, if it can.
+
+        Returns the vertices that are kept, (K,), and faces that index these, (G, 3).
+        """
         edges = [(u, v) for u, ring in enumerate(self.ring) for v in ring]
         heap = [(price, u, v, 0) for price, u, v in self._options(edges)]
         heapq.heapify(heap)
@@ -82,8 +76,7 @@ class _Sheet:
             age[v] += 1
             for price, a, b in self._options([pair for w in self.ring[v] for pair in ((v, w), (w, v))]):
                 heapq.heappush(heap, (price, a, b, age[a] + age[b]))
-        faces = np.array(list(self.faces.values()), np.int64)
-        kept, of_corner = np.unique(faces, return_inverse=True)
+        kept, of_corner = np.unique(np.array(list(self.faces.values())), return_inverse=True)
         return kept.astype(np.intp), of_corner.reshape(-1, 3).astype(np.int32)
 
     def _options(self, edges: Sequence[tuple[int, int]]) -> Iterator[tuple[float, int, int]]:
@@ -168,8 +161,7 @@ def _quadrics(vertices: NDArray[np.float64], mesh: Connectivity) -> tuple[NDArra
     for corner in range(3):
         rim = mesh.n_faces_of_edge[mesh.edge_of_corner[:, corner]] == 1
         start, end = mesh.faces[rim, corner], mesh.faces[rim, (corner + 1) % 3]
-        along = vertices[end] - vertices[start]
-        out = np.cross(along, normal[rim])
+        out = np.cross(vertices[end] - vertices[start], normal[rim])
         length = np.linalg.norm(out, axis=1)
         out /= np.maximum(length, 1e-18)[:, None]
         wall = np.concatenate((out, -(out * vertices[start]).sum(1, keepdims=True)), axis=1)

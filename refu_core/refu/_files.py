@@ -10,7 +10,7 @@ from refu_core.errors import WeightsError
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN
 from refu_core.refu._layer import Refu
-from refu_core.weights import Weights, build_for
+from refu_core.weights import Weights, build_for, naming
 
 _PREFIX = "refu."
 
@@ -25,8 +25,7 @@ def trained_from_weights(
 ) -> tuple[Backbone, Refu | None]:
     """The backbone and the layer (None where it was trained without) in `weights`, ready for use.
 
-    Raises:
-        WeightsError: they are of another version or garment, or their basis is missing, damaged or the wrong one.
+    Raises `WeightsError`: they are of another version or garment, or their basis is missing, damaged or the wrong one.
     """
     backbone: Backbone = backbone_from_weights(weights, garment, device=device).requires_grad_(False)
     refu = refu_from_weights(weights, device=device)
@@ -39,12 +38,10 @@ def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -
     if config is None:
         return None
     tensors = {k[len(_PREFIX) :]: v.float() for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
-    try:
+    with naming(f"{weights.path}: its ReFU layer doesn't fit its card"):
         refu = build_for(tensors, lambda: Refu.from_config(config))
         if not 0 <= refu.margin <= MAX_MARGIN or not 0 <= refu.config["least"] <= 1:
             got = f"{refu.margin:g} m and {refu.config['least']:g}"
             msg = f"wanted a margin of 0 to {MAX_MARGIN} m and a least scale of 0 to 1, got {got}; train it again"
             raise WeightsError(msg)
-    except WeightsError as error:
-        raise WeightsError(f"{weights.path}: its ReFU layer doesn't fit its card: {error}") from error
     return refu.float().to(device)

@@ -29,16 +29,12 @@ class Refu(nn.Module):
     def __init__(
         self, n_vertices: int, *, least: float, scale: ScaleSettings | None = REALTIME, margin: float = DEFAULT_MARGIN
     ) -> None:
-        """A layer for garments of `n_vertices` N.
+        """A layer for garments of `n_vertices`. Raises `MeshError` for none, and for a margin below 0 or not finite.
 
         Args:
-            n_vertices: N.
             least: lower end of α's range: 1 with an accurate distance, 0 with an approximate one (paper, Sec. 3.1).
             scale: sizes of the networks that predict α; None fixes it at 1.
             margin: ε > 0 [m], or 0 for the paper's.
-
-        Raises:
-            MeshError: no vertices, or a margin that is negative or not finite.
         """
         super().__init__()
         require_type(n_vertices, Integral, "a number of vertices", error=MeshError)
@@ -83,13 +79,8 @@ class Refu(nn.Module):
     def forward(self, points: Tensor, sample: SdfSample, z: Tensor | None = None) -> Tensor:
         """Pushes garments [m], shape (B, N, 3), whose distances (B, N) and gradients (B, N, 3) `sample` holds.
 
-        Args:
-            points: Garment vertices [m].
-            sample: Their signed distances to their own bodies.
-            z: Features of the bodies, shape (B, M), as `feature` gives them.
-
-        Raises:
-            MeshError: Another number of vertices than N, shapes that don't belong together, or no z for learned scales.
+        `z` are features of the bodies, shape (B, M), as `feature` gives them. Raises `MeshError` for another number of
+        vertices than N, for shapes that don't belong together, and without z for scales that are learned.
         """
         require_tensor("points", points)
         require_type(sample, SdfSample, "an SdfSample, as the query of a signed distance gives", error=MeshError)
@@ -104,5 +95,4 @@ class Refu(nn.Module):
             rows = pushed_rows(flat.distance, self.margin)
             pushed = self.scale(z, rows // self.n_vertices, rows % self.n_vertices, flat.distance[rows])
             alpha = torch.ones_like(flat.distance).index_copy(0, rows, pushed.to(flat.distance))
-        moved = repulse(points.reshape(-1, 3), flat, scale=alpha, margin=self.margin)
-        return moved.view_as(points)
+        return repulse(points.reshape(-1, 3), flat, scale=alpha, margin=self.margin).view_as(points)

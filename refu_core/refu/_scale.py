@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -69,21 +70,17 @@ class ScaleNet(nn.Module):
         self.n_vertices, self.least, self.settings = n_vertices, least, settings
         m, d = settings.feature_size, settings.latent_size
         if settings.kind != "distance":
-            self.h = nn.Sequential(
-                nn.Linear(N_INPUTS, settings.hidden_size),
-                nn.ReLU(),
-                nn.Linear(settings.hidden_size, settings.hidden_size),
-                nn.ReLU(),
-                nn.Linear(settings.hidden_size, m),
-                nn.ReLU(),
-            )
+            sizes = (N_INPUTS, settings.hidden_size, settings.hidden_size, m)
+            layers = (layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU()))
+            self.h = nn.Sequential(*layers)
         if settings.kind == "vertex":
             latent = d
             self.k: nn.Module = (
                 _CompactLatent(m, n_vertices, d) if settings.is_compact else _DenseLatent(m, n_vertices, d)
             )
-        elif settings.kind == "shared":
-            latent = _shared_latent_size(m, n_vertices, settings)
+        elif settings.kind == "shared":  # so that k' and g have as many weights as k and g of the kind `vertex`
+            k = n_vertices * d + (m + 1) * d if settings.is_compact else n_vertices * d * (m + 1)
+            latent = max(1, round((k + d * d) / (m + 1 + d)))
             self.k = nn.Linear(m, latent)
         else:
             latent = 0
@@ -119,8 +116,7 @@ class ScaleNet(nn.Module):
         # A pose far beyond training may overflow the networks; α = 1 is right to first order.
         usual = 1 - self.least
         bounded = torch.nan_to_num(raw + usual, nan=usual, posinf=_MAX_SCALE, neginf=-_MAX_SCALE)
-        alpha: Tensor = self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
-        return alpha
+        return self.least + functional.softplus(bounded, beta=_SHARPNESS).clamp_max(_MAX_SCALE)
 
     def of_body(self, z: Tensor) -> VertexScale:
         """α as `Resolver` asks for it, for the one body whose feature is z, shape (M,) or (1, M)."""
@@ -190,10 +186,3 @@ class _CompactLatent(nn.Module):
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor) -> Tensor:
         latent: Tensor = self.embedding[vertex] * self.projection(z)[body]
         return latent
-
-
-def _shared_latent_size(m: int, n: int, settings: ScaleSettings) -> int:
-    """D' for which k' and g have as many weights as k and g of the kind `vertex`."""
-    d = settings.latent_size
-    k = n * d + (m + 1) * d if settings.is_compact else n * d * (m + 1)
-    return max(1, round((k + d * d) / (m + 1 + d)))

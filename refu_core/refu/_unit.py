@@ -21,15 +21,10 @@ def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, m
     Differentiable with respect to the points, the sample and the scale. At f = ε the derivative is that of the outer
     branch.
 
-    Args:
-        points: Garment vertices [m], shape (N, 3).
-        sample: Signed distance and gradient at the points; the gradient needn't have unit length, and one that is zero
-            or not finite is replaced by up.
-        scale: α, one number or shape (N,); 1 is the paper's "fixed scale".
-        margin: ε ≥ 0 [m].
+    Gradients needn't have unit length, and one that is zero or not finite is replaced by up. `scale` is α, one number
+    or shape (N,); 1 is the paper's "fixed scale". `margin` is ε ≥ 0 [m].
 
-    Raises:
-        MeshError: Arrays whose shapes don't belong together, or a negative margin.
+    Raises `MeshError` for arrays whose shapes don't belong together, or a negative margin.
     """
     _check(points, sample, scale, margin)
     rows = pushed_rows(sample.distance, margin)
@@ -38,8 +33,7 @@ def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, m
     deficit = margin - sample.distance[rows]
     alpha = scale[rows] if isinstance(scale, Tensor) and scale.ndim else scale
     offset = (alpha * deficit).clamp(-MAX_DISPLACEMENT, MAX_DISPLACEMENT)
-    pushed: Tensor = points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
-    return pushed
+    return points.index_add(0, rows, offset[:, None] * unit_direction(sample.gradient[rows]))
 
 
 def pushed_rows(distance: Tensor, margin: float) -> Tensor:

@@ -102,7 +102,6 @@ class ApproxSdf(MeshSdf):
         self._exact = ExactSdf(body.faces, device=self.device, rebuild_distance=math.inf)
         self._exact.update(body.v_template.float())
         self._exact_is_late = True
-        self._none = torch.empty(0, dtype=torch.int32, device=self.device)
 
     @cached_property
     def _rest_faces(self) -> RestFaces:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, memory, recorded
+from refu_core._warp import Repeated, as_warp, memory, recorded
 from refu_core.body import SmplBody
 from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate
-from refu_core.mesh import Adjacency
+from refu_core.mesh import Adjacency, grouped_at_rest
 from refu_core.sdf._band_kernels import (
     ASKED,
     ROW,
@@ -26,7 +27,7 @@ from refu_core.sdf._band_kernels import (
     sort_kernel,
     spread_sides_kernel,
 )
-from refu_core.sdf._box_tree import BoxTree
+from refu_core.sdf._box_kernels import MAX_FACES, WIDTH, Boxes, Eight, fit_kernel
 from refu_core.sdf._closest_kernels import PosedMesh
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
@@ -39,6 +40,7 @@ garment's edges must be shorter than twice the band, to show that both of their 
 _FEW = 200
 """Fewer points than this are cheaper in a tree than in cells, which all faces of the body have to look through."""
 _N_ROWS = int(ROWS_X) * int(ROWS_Z)
+_WIDTH = int(WIDTH)
 
 
 class BandSdf(MeshSdf):
@@ -151,6 +153,40 @@ class BandSdf(MeshSdf):
             self._tree.fit(points)
             self._tree_is_posed = True
         return self._tree
+
+
+class BoxTree:
+    """The boxes that `closest_in_boxes` reads, eight to a node: built for one pose, fitted to all others, on a CPU."""
+
+    def __init__(self, faces: Tensor, rest: Tensor) -> None:
+        """For `faces`, int32, shape (F, 3), grouped by where they are in a pose with the vertices `rest` (V, 3) [m].
+
+        Faces that are close together there should be so in all poses; this affects speed alone.
+
+        Raises `MeshError` for more faces than it has room for.
+        """
+        n = len(faces)
+        if n > MAX_FACES:
+            raise MeshError(f"a tree of boxes holds {MAX_FACES} faces, got {n}: simplify the body")
+        depth = 0
+        while _WIDTH ** (depth + 1) < n:
+            depth += 1
+        n_above = sum(_WIDTH**level for level in range(depth))  # nodes whose children are nodes
+        corners = rest.detach().cpu().numpy()[faces.numpy()]
+        order = grouped_at_rest(0.5 * (corners.min(1) + corners.max(1)), _WIDTH)
+        self._order = torch.from_numpy(order.astype(np.int32))
+        self._bounds = memory(n_above + -(-n // _WIDTH), 6, _WIDTH)
+        self._bounds[:, :3], self._bounds[:, 3:] = torch.inf, -torch.inf
+        self.boxes: Any = Boxes()
+        """The boxes as kernels take them."""
+        self.boxes.bounds = wp.from_torch(self._bounds, dtype=Eight)
+        self.boxes.order = as_warp(self._order, wp.int32)
+        self.boxes.first = _WIDTH * n_above + 1
+        self._fit = Repeated(fit_kernel, (wp.vec3, wp.float32), [as_warp(faces, wp.int32), self.boxes])
+
+    def fit(self, points: Tensor) -> None:
+        """Fits the boxes to a pose with the vertices `points` (V, 3) [m]."""
+        self._fit((1,), points, self._bounds)
 
 
 class Scan:

@@ -17,7 +17,6 @@ _FEW = wp.constant(12)
 """While no more nodes than this wait, the oldest is next, else the newest. Twelve and six levels of seven more fit."""
 MAX_FACES = 8**6
 
-
 if TYPE_CHECKING:
     Eight = wp.Vector[float]
     _Queue = wp.Vector[int]

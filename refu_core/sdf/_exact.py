@@ -70,7 +70,6 @@ class ExactSdf(MeshSdf):
         self._rebuild_distance = rebuild_distance
         self._built_at = memory(0, 3)  # the pose the BVH was built for
         self._mesh: Any = None
-        self._none = torch.empty(0, dtype=torch.int32, device=self.device)
 
     def _take_pose(self, *, is_new: bool) -> None:
         if is_new or self._has_drifted():
@@ -121,8 +120,7 @@ class ExactSdf(MeshSdf):
         near = None if near is None else self._checked_faces(near, len(where), least=-1)
         found = self._find(where, near, min(max_distance, _UNLIMITED))
         _, barycentrics, _ = self._features(where, found.face)
-        sign = torch.where(found.distance < 0, -1.0, 1.0)
-        return ClosestPoints(found.face, barycentrics, found.distance.abs(), sign)
+        return ClosestPoints(found.face, barycentrics, found.distance.abs(), torch.where(found.distance < 0, -1.0, 1.0))
 
     def _find(self, points: Tensor, near: Tensor | None, max_distance: float = _UNLIMITED) -> Found:
         farthest = points.new_full((1,), max_distance)

@@ -15,8 +15,7 @@ from refu_core._warp import Repeated, as_warp, ints, memory
 from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
-from refu_core.sdf._analytic import Feature, signed_distance
-from refu_core.sdf._closest_kernels import PosedMesh, feature_kernel
+from refu_core.sdf._closest_kernels import EDGE, ON_SURFACE, VERTEX, PosedMesh, feature_kernel
 from refu_core.sdf._protocol import GarmentSdf, SdfSample, plain_garment_sdf
 from refu_core.sdf._query_kernels import Skin
 
@@ -44,11 +43,10 @@ FOUND = (wp.int32, wp.float32, wp.vec3)
 
 def ask(kernel: Repeated, points: Tensor, *more: Tensor) -> Found:
     """What a kernel says of points (N, 3) [m]; it takes them, `more`, and the fields of `Found` to be filled."""
-    n, device = len(points), points.device
-    face = torch.empty(n, dtype=torch.int32, device=device)
+    n = len(points)
+    face = torch.empty(n, dtype=torch.int32, device=points.device)
     found = Found(face, points.new_empty(n), points.new_empty(n, 3))
-    if n:
-        kernel((n,), points, *more, *found)
+    kernel((n,), points, *more, *found)
     return found
 
 
@@ -68,6 +66,7 @@ class MeshSdf(ABC):
         fan_start, fan_face = mesh.fan
         for name, array in (("across", mesh.across), ("fan_start", fan_start), ("fan_face", fan_face)):
             setattr(self._posed, name, ints(array, self.device))
+        self._none = torch.empty(0, dtype=torch.int32, device=self.device)
         self._vertices: Tensor | None = None  # as given, with its graph
         self._points: Tensor | None = None  # float32 copy that the kernels read
         self._skin: Any = None
@@ -112,19 +111,18 @@ class MeshSdf(ABC):
             return found.sample()
         corners = self._vertices.to(points)[self.faces.long()[found.face.long()]]
         kind, _, normal = self._features(where, found.face)
-        feature = Feature(kind, normal.to(points), found.distance.sign().to(points))
-        return signed_distance(points, corners, feature)._replace(face=found.face)
+        sample = signed_distance(points, corners, kind, normal.to(points), found.distance.sign().to(points))
+        return sample._replace(face=found.face)
 
     def of_garment(self, garment: GarmentTemplate) -> GarmentSdf:  # noqa: ARG002
         """As `BodySdf.of_garment`."""
         return plain_garment_sdf(self)
 
     def _features(self, points: Tensor, face: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of each point's closest face: `Feature.kind`, int32 (N,), barycentrics and unit pseudo-normals, (N, 3)."""
+        """`signed_distance`'s `kind`, int32 (N,), barycentrics and unit pseudo-normals, (N, 3), of closest faces."""
         kind = torch.empty_like(face)
         barycentrics, normal = points.new_empty(2, len(face), 3)
-        if len(face):
-            self._find_features((len(face),), points, face, kind, barycentrics, normal)
+        self._find_features((len(face),), points, face, kind, barycentrics, normal)
         return kind, barycentrics, normal
 
     def skin(self) -> Any:
@@ -166,6 +164,37 @@ class MeshSdf(ABC):
         if self._points is None:
             raise MeshError("no body yet: call update(vertices) before asking for distances")
         return self._points
+
+
+def signed_distance(points: Tensor, corners: Tensor, kind: Tensor, normal: Tensor, sign: Tensor) -> SdfSample:
+    """Distances and gradients of points (N, 3) from corners (N, 3, 3) of known faces, with exact first derivatives.
+
+    `kind` (N,) is the part of the face that is closest: 0 the interior, 1 to 3 its vertices, 4 to 6 its edges (0, 1),
+    (1, 2), (2, 0); `normal` (N, 3) the unit pseudo-normal there; `sign` (N,) the side of the body, +1 outside, -1
+    inside, 0 on its surface. To first order all three are constant around the point.
+    """
+    kind, each = kind.long(), torch.arange(len(points), device=points.device)
+    is_face, is_edge = (kind == 0)[:, None], (kind >= int(EDGE))[:, None]
+    first = torch.where(is_edge[:, 0], kind - int(EDGE), kind - int(VERTEX)).clamp_min(0)
+    start, along = corners[each, first], corners[each, (first + 1) % 3] - corners[each, first]
+    offset = points - start
+    t = (offset * along).sum(-1, keepdim=True) / (along * along).sum(-1, keepdim=True).clamp_min(1e-30)
+    offset = torch.where(is_edge, offset - t * along, offset)
+    a, b, c = corners.unbind(1)
+    up = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    above = ((points - a) * up).sum(-1)
+    # Within intersecting limbs the winding number's side may not be the normal's. On the surface rounding decides.
+    off_surface = above.detach().abs() > float(ON_SURFACE)
+    flip = torch.where(off_surface & (sign * above.detach() < 0), -1.0, 1.0).to(points)
+    # On an edge or vertex itself a distance has no derivative; the height over it along the pseudo-normal stands in.
+    height = (offset * normal).sum(-1)
+    touching = (torch.linalg.vector_norm(offset.detach(), dim=-1) < float(ON_SURFACE))[:, None]
+    length = torch.linalg.vector_norm(torch.where(touching, normal, offset), dim=-1)
+    distance = torch.where(touching[:, 0], height, sign * length)
+    gradient = torch.where(touching, normal, offset * (sign / length)[:, None])
+    return SdfSample(
+        torch.where(is_face[:, 0], flip * above, distance), torch.where(is_face, flip[:, None] * up, gradient)
+    )
 
 
 def require_outward(vertices: Tensor, faces: Tensor) -> None:

@@ -17,7 +17,7 @@ from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.sdf._mesh import require_points
 from refu_core.sdf._protocol import GarmentSdf, SdfSample, plain_garment_sdf
-from refu_core.weights import Weights, build_for, config_of_card, load_weights, save_weights
+from refu_core.weights import build_for, config_of_card, load_weights, naming, save_weights
 
 _CONDITION = N_BETAS + 3 * (N_JOINTS - 1)
 _MOST_LAYERS = 64
@@ -86,8 +86,7 @@ class SdfNetwork(nn.Module):
 
         `pose`, shape (B, 23, 3) [rad], is without the root's rotation, which is to be undone in the points.
         """
-        condition = self.condition(torch.cat((betas, pose.flatten(1)), 1))
-        h = self.activation(self.point(points) + condition[:, None])
+        h = self.activation(self.point(points) + self.condition(torch.cat((betas, pose.flatten(1)), 1))[:, None])
         for number, layer in enumerate(self.layers, start=1):
             h = self.activation(layer(torch.cat((h, points.to(h.dtype)), -1) if number == self.config.skip else h))
         distance: Tensor = self.last(h)[..., 0]
@@ -129,9 +128,8 @@ class NeuralSdf:
         """
         del vertices
         if pose is None or betas is None or pose.shape != (N_JOINTS, 3) or betas.shape != (N_BETAS,):
-            shapes = [None if value is None else tuple(value.shape) for value in (pose, betas)]
-            msg = f"a neural distance needs pose (24, 3) and betas (10,) of the body, got {shapes[0]} and {shapes[1]}"
-            raise MeshError(msg)
+            got = " and ".join(str(None if value is None else tuple(value.shape)) for value in (pose, betas))
+            raise MeshError(f"a neural distance needs pose (24, 3) and betas (10,) of the body, got {got}")
         rotation, root = body_frame(self._body, pose[None], betas[None])
         self._posed = rotation[0], root[0], betas, pose[1:]
 
@@ -177,19 +175,15 @@ def save_sdf_network(stem: Path, network: SdfNetwork, card: Mapping[str, Any]) -
 def load_sdf_network(stem: Path, body: SmplBody) -> SdfNetwork:
     """The network that `save_sdf_network` wrote, for a body with the fingerprint it was trained on.
 
-    Raises:
-        WeightsError: nothing there, damaged, or trained on another body.
+    Raises `WeightsError` where there is none, it is damaged, or trained on another body.
     """
-    weights: Weights = load_weights(stem)
-    trained_on = weights.card.get("body_fingerprint")
-    if trained_on != body.fingerprint:
-        msg = f"{stem}: trained on the body {trained_on}, this one is {body.fingerprint}: train one for it"
-        raise WeightsError(msg)
-    try:
+    weights = load_weights(stem)
+    trained_on, this = weights.card.get("body_fingerprint"), body.fingerprint
+    if trained_on != this:
+        raise WeightsError(f"{stem}: trained on the body {trained_on}, this one is {this}: train one for it")
+    with naming(f"{stem}: not the weights of a distance network"):
         config = config_of_card(SdfNetworkConfig, weights.card.get("network"))
         if config.hidden > _MOST_LAYERS:
             raise WeightsError(f"wanted at most {_MOST_LAYERS} hidden layers, got {config.hidden}")
         network = build_for(weights.tensors, lambda: SdfNetwork(config))
-    except WeightsError as error:
-        raise WeightsError(f"{stem}: not the weights of a distance network: {error}") from error
     return network.to(device=body.device, dtype=body.dtype)

@@ -56,12 +56,10 @@ class GarmentSdf(Protocol):
     """The signed distance of a garment's vertices to one posed body."""
 
     def __call__(self, vertices: Tensor, *, on_mean: Tensor, reach: float = math.inf) -> SdfSample:
-        """Distance and gradient of posed vertices [m], shape (N, 3). Not differentiable.
+        """Distance and gradient of posed vertices [m], shape (N, 3), in the frame of the body's. Not differentiable.
 
-        Args:
-            vertices: In the frame of the body's vertices [m], shape (N, 3).
-            on_mean: Where they are on the unposed mean shape [m], shape (N, 3).
-            reach: Distances beyond it [m] may be clipped from above; such a sample's face is -1.
+        `on_mean` is where they are on the unposed mean shape [m], shape (N, 3). Distances beyond `reach` [m] may be
+        clipped from above; such a sample's face is -1.
         """
         ...
 

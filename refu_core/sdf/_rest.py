@@ -52,8 +52,7 @@ class RestFaces:
         """Near body faces, int32 of shape (...,), of places on the mean shape in the rest pose [m], shape (..., 3)."""
         places = unposed.detach().to(device=self._device, dtype=torch.float32).reshape(-1, 3).contiguous()
         near = torch.empty(len(places), dtype=torch.int32, device=self._device)
-        if len(places):
-            self._look_up((len(places),), places, near)
+        self._look_up((len(places),), places, near)
         return near.view(unposed.shape[:-1])
 
 

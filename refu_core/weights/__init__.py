@@ -2,6 +2,7 @@
 
 from refu_core.weights._config import build_for as build_for
 from refu_core.weights._config import config_of_card as config_of_card
+from refu_core.weights._config import naming as naming
 from refu_core.weights._files import FORMAT as FORMAT
 from refu_core.weights._files import Weights as Weights
 from refu_core.weights._files import load_card as load_card

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, Field, fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,6 +24,15 @@ _WRONG = (KeyError, TypeError, ValueError, AttributeError, LookupError, Arithmet
 
 Config = TypeVar("Config", bound="DataclassInstance")
 Module = TypeVar("Module", bound=nn.Module)
+
+
+@contextmanager
+def naming(what: object) -> Iterator[None]:
+    """Has a `WeightsError` begin with what it is about, such as a file's path."""
+    try:
+        yield
+    except WeightsError as error:
+        raise WeightsError(f"{what}: {error}") from error
 
 
 def config_of_card(kind: type[Config], values: Any) -> Config:

@@ -84,13 +84,8 @@ def save_weights(
         differs = {"base": base, "base_sha256": loaded.card["sha256"]}
         tensors = _differences(tensors, loaded.tensors)
     data = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()})
-    full = {
-        "format": FORMAT,
-        **card,
-        **differs,
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "versions": versions("torch"),
-    }
+    digest = hashlib.sha256(data).hexdigest()
+    full = {"format": FORMAT, **card, **differs, "sha256": digest, "versions": versions("torch")}
     path = Path(f"{stem}.safetensors")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from refu_core import load_body
 from refu_core.body import ARMS, Collider, ColliderSettings, RigidTransforms, SmplBody, rotvec_to_rotmat
+from refu_core.body._aside import Aside
 from refu_core.body._creases import _parting
 from refu_core.errors import MeshError
 from refu_core.metrics import SelfContactDetector
@@ -209,7 +210,7 @@ def test_an_arm_that_is_too_deep_is_held(body: SmplBody, collider: Collider) -> 
     """Its middles go as far as an arm may, and it is said."""
     skin = body(pose=posed(body, {"left_shoulder": (0, 0, -1.75)}))
     aside, _ = collider.aside(skin.vertices, skin.transforms.rotation)
-    middles = [collider.anatomy.aside.middles(one[0]) for one in (skin.vertices, aside)]
+    middles = [_middles(collider.anatomy.aside, one[0]) for one in (skin.vertices, aside)]
     assert float((middles[1] - middles[0]).norm(dim=1).max()) == pytest.approx(
         collider.settings.aside_farthest, rel=0.02
     )
@@ -224,11 +225,16 @@ def test_an_arm_that_is_too_deep_is_held(body: SmplBody, collider: Collider) -> 
     torch.testing.assert_close(collider.shift(skin.vertices, aside, apart)[0], wanted, atol=1e-6, rtol=1e-5)
 
 
+def _middles(aside: Aside, skin: torch.Tensor) -> torch.Tensor:
+    """The middles of arms, palms, fingers and thumbs of `skin` (V, 3) [m], shape (C, 3)."""
+    return aside._means(skin)[len(ARMS) : aside._first_cap]
+
+
 def _asked(collider: Collider, skin: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Skin (V, 3) [m] with the middles of its caps, which the tree is of from now on, and what may be inside of it."""
     aside = collider.anatomy.aside
     aside(skin, torch.eye(3).expand(24, 3, 3))
-    return torch.cat((skin, aside._means(skin)[aside._first_cap :])), aside.middles(skin)
+    return torch.cat((skin, aside._means(skin)[aside._first_cap :])), _middles(aside, skin)
 
 
 def test_a_seam_parts_the_means_of_the_skin_on_its_two_sides(body: SmplBody) -> None:
@@ -305,7 +311,7 @@ def _the_same() -> tuple[SmplBody, Collider]:
 def _replaced(body: SmplBody, **arrays: NDArray[np.generic]) -> SmplBody:
     from refu_core.body._model import BodyArrays
 
-    known = body._arrays
+    known = body.arrays
     given_ = {
         "v_template": known.v_template,
         "f": known.faces,
@@ -320,7 +326,7 @@ def _replaced(body: SmplBody, **arrays: NDArray[np.generic]) -> SmplBody:
 
 
 def _with_fewer_vertices(body: SmplBody, n: int) -> SmplBody:
-    faces, known = body.faces.numpy().copy(), body._arrays
+    faces, known = body.faces.numpy().copy(), body.arrays
     gone = np.zeros(body.n_vertices, bool)
     locked = np.zeros(body.n_vertices, bool)
     for a, b, _ in faces[::40]:

@@ -326,7 +326,7 @@ def test_what_does_not_belong_together_is_refused(folder: Path) -> None:
         ({"config": {"joints": [0, 1], "depth": 3}}, "doesn't know"),
     ):
         (folder / "dynamics.json").write_text(json.dumps(stored | change))
-        with pytest.raises(WeightsError, match=message):
+        with pytest.raises(WeightsError, match=rf"dynamics\.\w+: .*{message}"):
             load_backbone("dynamic", GARMENT, mode="hybrid", folder=folder)
     (folder / "dynamics.json").unlink()
     with pytest.raises(WeightsError, match="no such weights"):

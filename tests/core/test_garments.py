@@ -169,7 +169,7 @@ def test_paths_that_name_no_garment_are_refused(tmp_path: Path) -> None:
         load_garment(tmp_path / "kilt.npz")
     with pytest.raises(GarmentError, match="a garment has its file's name"):
         load_garment(write_garment(tmp_path / "a kilt.npz"))
-    with pytest.raises(GarmentError, match=r"a garment is a name or the path of an \.npz, got int"):
+    with pytest.raises(GarmentError, match=r"wanted a garment's name or the path of an \.npz, got int"):
         load_garment(5)  # type: ignore[arg-type]
 
 

@@ -78,7 +78,7 @@ def test_a_file_is_registered_once(female: Path, fit: BodyFit, monkeypatch: pyte
     def never(*_: Any) -> Any:
         pytest.fail("registered again")
 
-    monkeypatch.setattr(_fit, "register", never)
+    monkeypatch.setattr(_fit.Registrar, "run", never)
     again = load_fit(female)
     np.testing.assert_array_equal(again.registration.vertices, fit.registration.vertices)
     np.testing.assert_array_equal(again.registration.place.weight, fit.registration.place.weight)
@@ -97,7 +97,7 @@ def test_what_was_kept_and_is_damaged_is_made_again(
             np.savez(here, **{**arrays, "face": np.full_like(arrays["face"], N_FACES)})
     made = []
     monkeypatch.setenv("REFU_CACHE", str(tmp_path))
-    monkeypatch.setattr(_fit, "register", lambda *_: made.append(1) or fit.registration)
+    monkeypatch.setattr(_fit.Registrar, "run", lambda *_: made.append(1) or fit.registration)
     assert load_fit(fit.body).registration.mean_distance == pytest.approx(fit.registration.mean_distance, rel=1e-5)
     assert made
 
@@ -105,7 +105,7 @@ def test_what_was_kept_and_is_damaged_is_made_again(
 def test_nowhere_to_keep_anything(fit: BodyFit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REFU_CACHE", str(tmp_path / "file" / "folder"))
     (tmp_path / "file").write_text("in the way")
-    monkeypatch.setattr(_fit, "register", lambda *_: fit.registration)
+    monkeypatch.setattr(_fit.Registrar, "run", lambda *_: fit.registration)
     assert load_fit(fit.body).registration.vertices.shape == fit.registration.vertices.shape
 
 
