@@ -112,16 +112,16 @@ class _Finished:
         self.parts = self._parts(self._columns["vertices"].shape[-2])
         """The slice of a row's vertices of each garment: several where garments were simulated together."""
         self._clips = self._clip_names()
-        self._check("split", 0, 2)
+        self._check("split", 0, 1)
         self.test: NDArray[np.bool_] = self.column("split") == TEST
         self.train: NDArray[np.bool_] = ~self.test
         """Which rows are for training, shape (M,); the others, `test`, are kept for the test."""
-        self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])))
+        self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])) - 1)
         if self.card.get("quantum_m") != QUANTUM:
             msg = f"{path}: wanted positions in units of {QUANTUM} m, got {str(self.card.get('quantum_m'))[:80]}"
             raise SimulationError(msg)
         for name, largest in (("pose", MAX_ANGLE), ("betas", MAX_COEFFICIENT), ("style", MAX_COEFFICIENT)):
-            self._check_numbers(name, largest)
+            self._check(name, -largest, largest)
 
     def _parts(self, n_vertices: int) -> dict[str, slice]:
         """Raises `SimulationError` for a card whose garments don't have that many vertices."""
@@ -143,24 +143,14 @@ class _Finished:
             raise SimulationError(msg)
         return {split: [str(name) for name in value or ()] for split, value in names.items()}
 
-    def _check(self, name: str, low: int, high: Any) -> None:
-        """Raises `SimulationError` where a column of whole numbers is below `low`, or not below `high`."""
+    def _check(self, name: str, low: float, high: Any) -> None:
+        """Raises `SimulationError` where a column has a number that isn't from `low` to `high`."""
         values = self.column(name)
         high = np.broadcast_to(high, values.shape)
-        bad = np.flatnonzero((values < low) | (values >= high))
+        bad = np.flatnonzero(~((values >= low) & (values <= high)))  # also NaN
         if bad.size:
-            msg = f"{self._path}: damaged: {name} is {values.flat[bad[0]]}, "
-            msg += f"wanted {low} to {high.flat[bad[0]] - 1}; simulate it again"
-            raise SimulationError(msg)
-
-    def _check_numbers(self, name: str, largest: float) -> None:
-        """Raises `SimulationError` where a column has numbers that no `SmplFrame` accepts."""
-        values = self.column(name).reshape(len(self), -1)
-        bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))  # False for NaN
-        if bad.size:
-            msg = f"{self._path}: damaged: {name} of sample {bad[0]} isn't finite and at most {largest:g}; "
-            msg += "simulate it again"
-            raise SimulationError(msg)
+            got = f"{name} is {values.flat[bad[0]]}, wanted {low:g} to {high.flat[bad[0]]:g}"
+            raise SimulationError(f"{self._path}: damaged: {got}; simulate it again")
 
     def __len__(self) -> int:
         """Finished rows."""
@@ -200,7 +190,7 @@ class GarmentDataset(_Finished):
         if not isinstance(count, int) or not 0 <= count < 2**31:
             msg = f"{path}: wanted a card with the number of samples in plan.count, got {str(count)[:80]}"
             raise SimulationError(msg)
-        self._check("slot", 0, count)
+        self._check("slot", 0, count - 1)
         self._unseen = read_unseen(self._path, count)
 
     def sample(self, index: int) -> GarmentSample:
@@ -230,7 +220,7 @@ class GarmentSequences(_Finished):
     def __init__(self, path: str | Path) -> None:
         """Opens the set in the directory `path`. Raises `SimulationError` when there is none, or a damaged one."""
         super().__init__(path, SEQUENCES, first_clip=0)
-        self._check("cause", 0, len(CAUSES) + 1)
+        self._check("cause", 0, len(CAUSES))
 
     def sequence(self, index: int) -> GarmentSequence:
         """The sequence of this index, -S to S - 1. Raises `SimulationError` when there is no such sequence."""

@@ -21,7 +21,7 @@ from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
 from refu_core.metrics import SheetChecker
-from refu_core.realtime._turn import RootTurn
+from refu_core.realtime import RootTurn
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothSettings, ClothTopology, SimulatedCloth
 from refu_core.simulation._joined import JoinedGarments
@@ -303,9 +303,6 @@ class Draper:
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
         level = self._untangle(self.cloth.positions, body)
-        return SettledDrape(self._with_root(level, root, betas), speed, self.cloth.stretch(level))
-
-    def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
-        turned: F32 = np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
-        return turned
+        turned = np.ascontiguousarray(root.apply(level.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
+        return SettledDrape(turned, speed, self.cloth.stretch(level))

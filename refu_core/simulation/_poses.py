@@ -124,9 +124,9 @@ def without_heading(pose: NDArray[np.floating]) -> NDArray[np.float32]:
     return out
 
 
-def mirrored(pose: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The pose (24, 3) of the mirror image, left and right exchanged [rad]."""
-    image: NDArray[np.float32] = np.asarray(pose, np.float32)[MIRRORED_JOINTS,] * np.array([1, -1, -1], np.float32)
+def mirrored(poses: NDArray[np.floating]) -> NDArray[np.float32]:
+    """The poses (…, 24, 3) of the mirror image, left and right exchanged [rad]."""
+    image: NDArray[np.float32] = poses[..., MIRRORED_JOINTS, :] * np.array([1, -1, -1], np.float32)
     return image
 
 

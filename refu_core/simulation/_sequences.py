@@ -81,10 +81,9 @@ def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) 
     first = int(rng.integers(lengths[which] - n + 1))
     mirror = bool(rng.random() < 0.5)
     clip = clips[which].resampled(rate)
-    poses, transl = clip.poses[first : first + n].copy(), clip.transl[first : first + n].copy()
+    poses, transl = clip.poses[first : first + n], clip.transl[first : first + n]
     if mirror:
-        poses = np.stack([mirrored(pose) for pose in poses])
-        transl[:, 0] *= -1
+        poses, transl = mirrored(poses), transl * (-1, 1, 1)
     root = Rotation.from_rotvec(poses[:, 0].astype(np.float64))
     heading = Rotation.from_rotvec(without_heading(poses[0])[0].astype(np.float64)) * root[0].inv()
     poses[:, 0] = (heading * root).as_rotvec()
