@@ -15,14 +15,11 @@ from scipy.optimize import minimize
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import no_opening
-from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._mesh_file import F64, SurfaceMesh
 from refu_core.fitting._placing import UNITS, Placing
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
-from refu_core.fitting._shifts import HIGHEST, LIFTS, heights, shifts
 from refu_core.fitting._surround import NEAR, Fit, Samples, fits_of, lies_over, parts_legs, sample
-from refu_core.fitting._turns import LYING, is_sideways_turn, turns_of
-
-F64 = NDArray[np.float64]
+from refu_core.fitting._ways import HIGHEST, LIFTS, LYING, heights, is_sideways_turn, shifts, turns_of
 
 _SIZES = (0.12, 2.1)
 """The largest extent of a garment [m]: from a sock to a gown with a train."""
