@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from refu_core._pickle_machine import Record
 from refu_core.recordings import _layouts as table
-from refu_core.recordings._containers import MOST_DEPTH, Content, Key, entries
+from refu_core.recordings._containers import MOST_DEPTH, Content, Key, entries, held_by
 from refu_core.recordings._recording import MAX_FRAMES, interpolated
 from refu_core.recordings._rotations import is_one_frame
 
@@ -249,15 +249,11 @@ def _who_is_who(frames: Iterable[Sequence[tuple[str, NDArray[np.float64]]]]) -> 
 
 
 def _mapping(value: Any) -> Mapping[Key, Any] | None:
-    return None if isinstance(value, (list, tuple)) else entries(value)
+    return None if isinstance(held_by(value), (list, tuple)) else entries(value)
 
 
 def _items(value: Any) -> Sequence[Any]:
-    if isinstance(value, Record) and value.kind == "array":  # NumPy's way to save objects
-        state = value.state
-        held = state[4] if isinstance(state, tuple) and len(state) == 5 and isinstance(state[4], list) else ()
-        return _items(held[0]) if len(held) == 1 else held
-    inside = _mapping(value)
-    if inside is not None:
-        return list(inside.values())
-    return value if isinstance(value, (list, tuple)) else ()
+    value = held_by(value)
+    if isinstance(value, (list, tuple)):
+        return value
+    return list((entries(value) or {}).values())
