@@ -280,5 +280,4 @@ def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start
 
 def _aligned(before: list[Array], after: list[Array]) -> Array:
     """The smallest rotation of one direction onto another (3,); with two of each, the second is only turned towards."""
-    turn: Array = Rotation.align_vectors(after, before, weights=[np.inf, 1.0][: len(before)])[0].as_matrix()
-    return turn
+    return Rotation.align_vectors(after, before, weights=[np.inf, 1.0][: len(before)])[0].as_matrix()

@@ -73,8 +73,7 @@ def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
         taken[i] = taken.get(i, 0) | bit
         taken[j] = taken.get(j, 0) | bit
         colour[k] = bit.bit_length()
-    found: NDArray[np.int32] = pairs[np.argsort(colour, kind="stable")]
-    return found
+    return pairs[np.argsort(colour, kind="stable")]
 
 
 _Contacts = tuple[I32, F32, F32, F32]

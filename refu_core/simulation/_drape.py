@@ -219,8 +219,7 @@ class Draper:
 
     def rest(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> F32:
         """The garment cut for this shape and style [m], shape (N, 3): its edges are the cloth's rest lengths."""
-        rest: F32 = self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
-        return rest
+        return self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
 
     def bodies(self, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
         """What cloth lies on: the colliders of poses (P, 24, 3) [rad] and a shape (10,) [m], shape (P, V, 3)."""

@@ -126,8 +126,7 @@ def without_heading(pose: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def mirrored(poses: NDArray[np.floating]) -> NDArray[np.float32]:
     """The poses (…, 24, 3) of the mirror image, left and right exchanged [rad]."""
-    image: NDArray[np.float32] = poses[..., MIRRORED_JOINTS, :] * np.array([1, -1, -1], np.float32)
-    return image
+    return poses[..., MIRRORED_JOINTS, :] * np.array([1, -1, -1], np.float32)
 
 
 def random_pose(rng: np.random.Generator) -> NDArray[np.float32]:
@@ -208,8 +207,7 @@ _STIFF = tuple(JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right")
 
 def posture(name: str) -> NDArray[np.float32]:
     """One of `POSTURES`, rotation vectors [rad], shape (24, 3). Raises `KeyError` for another name."""
-    pose: NDArray[np.float32] = np.radians(posed(POSTURES[name])).astype(np.float32)
-    return pose
+    return np.radians(posed(POSTURES[name])).astype(np.float32)
 
 
 def drawn_posture(rng: np.random.Generator, names: Sequence[str]) -> tuple[NDArray[np.float32], int]:

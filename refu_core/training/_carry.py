@@ -227,8 +227,7 @@ def _borne_out(carried: Tensor, truth: Tensor, controls: Controls) -> Tensor:
     field = controls.matrix()
     near = field.clamp_min(0).T / field.clamp_min(0).sum(0)[:, None]
     least = _DOUBT * own.mean() + torch.finfo().tiny
-    share: Tensor = (field @ ((near @ common) / (near @ own + least))).clamp(0, 1)
-    return share
+    return (field @ ((near @ common) / (near @ own + least))).clamp(0, 1)
 
 
 def _smooth_basis(displacement: Tensor, controls: Controls, rank: int) -> BasisDecoder:

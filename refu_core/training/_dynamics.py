@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core.backbones import Dynamics, DynamicsConfig, TailorNet, backbone_from_weights, save_dynamics
+from refu_core.backbones import Dynamics, DynamicsConfig, TailorNet, save_dynamics
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.frames import SmplFrame
@@ -31,7 +31,6 @@ from refu_core.training._data import (
 )
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._pretrain import code_loss
-from refu_core.weights import load_weights
 
 
 @dataclass(frozen=True)
@@ -98,11 +97,8 @@ def train_dynamics(
         msg = f"dynamics are learnt from sequences, got samples at rest: refu simulate {template.name} --sequences"
         raise RefuError(msg)
     test = read_samples(rows, body, template, split="test")  # a missing test split is reported before any work
-    stored = load_weights(folder / f"tailornet-{mode}", expect=opened.identity)
-    still = backbone_from_weights(stored, template)
-    if not isinstance(still, TailorNet):
-        raise RefuError(f"{stored.path}: wanted a tailornet, got {type(still).__name__}")
-    settings = DynamicsSettings() if settings is None else settings
+    still, card_of_still = opened.tailornet(folder, mode)
+    settings = settings or DynamicsSettings()
     torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
@@ -115,13 +111,12 @@ def train_dynamics(
     described = {
         **opened.identity,
         "mode": mode,
-        "tailornet_sha256": stored.card["sha256"],
+        "tailornet_sha256": card_of_still["sha256"],
         "settings": asdict(settings),
         "samples": len(train.code),
     }
     identity = [described, asdict(dynamics.config)]
     loop = Loop(dynamics, settings.loop, folder / "dynamics", identity, torch_device, quiet=quiet)
-    dynamics.to(torch_device)
 
     def predict(x: Tensor, s: Tensor, past: Tensor) -> Tensor:
         if dynamics.training:

@@ -152,7 +152,7 @@ def finetune(
     described |= {"samples": len(train), "from_scratch": weights is None}
     in_refu, in_loss, _ = _MODES[mode]
     garment, there = template.to(device=torch_device), body.to(device=torch_device)
-    dresser = Dresser(network, refu, garment, there, in_refu, in_loss, is_blended=settings.is_blended).to(torch_device)
+    dresser = Dresser(network, refu, garment, there, in_refu, in_loss, is_blended=settings.is_blended)
     loop = Loop(dresser, settings.loop, stem, described, torch_device, quiet=quiet)
 
     def loss(dressed: Tensor, truth: Tensor) -> Tensor:

@@ -14,9 +14,7 @@ from refu_core.backbones import (
     BasisDecoder,
     Lying,
     LyingConfig,
-    TailorNet,
     WithLying,
-    backbone_from_weights,
     lying_share,
     save_lying,
     up_in_root,
@@ -38,7 +36,6 @@ from refu_core.training._data import (
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._pretrain import code_loss
 from refu_core.training._rehearsal import Rehearsal
-from refu_core.weights import load_weights
 
 
 @dataclass(frozen=True)
@@ -91,11 +88,8 @@ def train_lying(
     if not len(samples) or not len(test):
         msg = f"wanted lying people to learn from and to test on, the set of {template.name} has {len(samples)} and "
         raise RefuError(f"{msg}{len(test)}: refu simulate --postures")
-    stored = load_weights(folder / f"tailornet-{mode}", expect=opened.identity)
-    upright = backbone_from_weights(stored, template).requires_grad_(False)
-    if not isinstance(upright, TailorNet):
-        raise RefuError(f"{stored.path}: wanted a tailornet, got {type(upright).__name__}")
-    settings = LyingSettings() if settings is None else settings
+    upright, card_of_upright = opened.tailornet(folder, mode)
+    settings = settings or LyingSettings()
     torch_device = start_parallel(device)
     train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     train = train.joined(mirrored(train, Mirror.of(template)))
@@ -106,7 +100,7 @@ def train_lying(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         lying = Lying(LyingConfig(upright.config.joints), decoder)
-    rehearsed = rehearsal.of(stored.card, upright, known=opened.card["plan"])
+    rehearsed = rehearsal.of(card_of_upright, upright, known=opened.card["plan"])
     rehearsed = rehearsed.take(_lie(rehearsed.pose))
     owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
     parts = [
@@ -118,13 +112,12 @@ def train_lying(
     described = {
         **opened.identity,
         "mode": mode,
-        "tailornet_sha256": stored.card["sha256"],
+        "tailornet_sha256": card_of_upright["sha256"],
         "settings": asdict(settings),
         "samples": len(train),
         "rehearsed": len(rehearsed),
     }
     loop = Loop(lying, settings.loop, folder / "lying", [described, asdict(lying.config)], torch_device, quiet=quiet)
-    lying.to(torch_device)
     loop.run(TrainingStage("lying", Objective([lying], lying, code_loss(lying)), settings.steps, *parts))
     lying.to("cpu").eval()
     both: dict[str, Backbone] = {"mpve_mm": WithLying(upright, lying), "upright_mm": upright}

@@ -187,9 +187,7 @@ def pretrain(
             config = model.config
         bring_basis(Path(start), output, written=stem.name)
     loop = Loop(model, settings.loop, stem, [described, asdict(config)], torch_device, quiet=quiet)
-    to_run = stages(model, train, validation, template, settings, goes_on=stored is not None)
-    model.to(torch_device)
-    for stage in to_run:
+    for stage in stages(model, train, validation, template, settings, goes_on=stored is not None):
         loop.run(stage)
     model.to("cpu").eval()
     card = {
