@@ -65,12 +65,8 @@ def fps_of(content: Content, value: Any) -> float:
     """Frames a second. Raises `ValueError` if there is no such number."""
     if value is None:
         raise ValueError(f"no frame rate in the file: {_SAY_IT}")
-    if type(value) in (int, float):
-        return float(value)
-    array = np.asarray(value) if isinstance(value, str) else content.array(value)
-    if array.size == 1 and array.dtype.kind in "iuf":
-        return float(array.reshape(-1)[0])
-    if array.size == 1 and array.dtype.kind in "US":
+    array = np.asarray(value) if isinstance(value, (int, float, str)) else content.array(value)
+    if array.size == 1 and array.dtype.kind in "iufUS":
         with contextlib.suppress(ValueError):
             return float(word_of(content, array))
     got = f"{table.RATES[0]} must be one number, got {array.dtype} {array.shape}"

@@ -194,8 +194,7 @@ class Draper:
         self.topology = ClothTopology.of(garment.mesh)
         # The BVH decides which of two equally close faces is found, and so a result's last bit. It is built anew for
         # each drape, on a mesh that depends on the drape alone, and never in between.
-        sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
-        self._sdf = sdf
+        self._sdf = sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._collider = Collider(body, settings=ColliderSettings(gap=self.settings.gap))
         counts = [garment.n_vertices for garment in self.outfit.garments]
         piece = np.repeat(np.arange(len(counts)), counts)
@@ -289,7 +288,6 @@ class Draper:
         bodies = self.bodies(poses, betas)
         self.begin(start, betas, style, bodies[-1])
         down = np.array([0, -GRAVITY, 0])
-        gravity = np.zeros(3, np.float32)
         for after, tilt in zip(bodies, tilts, strict=True):
             gravity = Rotation.from_rotvec(tilt[0]).inv().apply(down).astype(np.float32)
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])

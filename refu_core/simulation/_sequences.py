@@ -132,8 +132,7 @@ class SequencePlan:
 
     def blocks(self) -> list[list[int]]:
         """Each sequence by itself, in an order that mixes shapes and motions."""
-        order = np.random.default_rng(self._key(0)).permutation(self.count)
-        return [[int(slot)] for slot in order]
+        return [[int(slot)] for slot in np.random.default_rng(self._key(0)).permutation(self.count)]
 
     def _key(self, *numbers: int) -> list[int]:
         return [self.seed, zlib.crc32(f"{names_of(self.garment)} sequences".encode()), *numbers]
@@ -145,8 +144,7 @@ class SequencePlan:
 
     def motion(self, slot: int, clips: list[Clip]) -> DrawnMotion:
         """The motion that a sequence shows. Raises `SimulationError` when no clip is long enough."""
-        rng = np.random.default_rng(self._key(2, slot))
-        return draw_motion(clips, self.n_frames, rng)
+        return draw_motion(clips, self.n_frames, np.random.default_rng(self._key(2, slot)))
 
 
 @dataclass(frozen=True)
