@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refu_core.errors import GarmentError
-from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.garments import UvMap
 from refu_core.mesh import Connectivity, face_normals, linked
-
-Ints = NDArray[np.int64]
 
 _SAME_PLACE = 1e-5
 """Vertices closer to each other than this are merged, as a share of the mesh's extent: 10 µm for a dress."""
@@ -129,7 +127,7 @@ def _without_strays(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     return mesh.only(kept)
 
 
-def _groups_of_place(v: NDArray[np.float64], extent: float) -> Ints:
+def _groups_of_place(v: F64, extent: float) -> Ints:
     """For each vertex the first one at the same place, shape (V,), in a mesh of some extent."""
     # Vertices in one tiny cell are merged before pairs are looked for: a crowd would make countless pairs.
     cell = np.floor((v - v.min(0)) / (_SAME_PLACE * extent / np.sqrt(3)))
@@ -144,20 +142,17 @@ def _without_double_faces(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
     extent = float(np.linalg.norm(np.ptp(mesh.compact().vertices, axis=0)))
     n = len(mesh.faces)
     # Faces without area go first: their corners may all be at one place, and make countless pairs.
-    mesh = _only(mesh, np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1) >= (1e-7 * extent) ** 2)
+    has_area = np.linalg.norm(face_normals(mesh.vertices, mesh.faces), axis=1) >= (1e-7 * extent) ** 2
+    mesh = mesh.only(has_area).compact()
     place = _groups_of_place(mesh.vertices, extent)[mesh.faces]
     has_area = (place != np.roll(place, 1, 1)).all(1)
-    mesh, place = _only(mesh, has_area), place[has_area]
+    mesh, place = mesh.only(has_area).compact(), place[has_area]
     if n > len(mesh.faces):
         notes.append(f"{n - len(mesh.faces)} faces without area were left out")
     _, first = np.unique(np.sort(place, 1), axis=0, return_index=True)
     if len(first) < len(place):
         notes.append(f"{len(place) - len(first)} faces were there twice and are there once")
     return mesh.only(np.isin(np.arange(len(place)), first))
-
-
-def _only(mesh: SurfaceMesh, kept: NDArray[np.bool_]) -> SurfaceMesh:
-    return (mesh if kept.all() else mesh.only(kept)).compact()
 
 
 def _welded(mesh: SurfaceMesh, notes: list[str]) -> SurfaceMesh:
@@ -237,12 +232,9 @@ def _cut_apart(mesh: SurfaceMesh, pairs: Ints) -> SurfaceMesh:
     # Faces are oriented alike, so an edge begins in one face where it ends in the other.
     links = np.concatenate((np.stack((one, following[other]), 1), np.stack((following[one], other), 1)))
     count, label = linked(links, n)
-    vertices = np.empty((count, 3))
-    vertices[label] = mesh.vertices[f.ravel()]
-    order = np.full(count, n, np.int64)
-    np.minimum.at(order, label, f.ravel())  # the file's order, where nothing was cut
-    rank = np.empty(count, np.int64)
-    rank[np.argsort(order, kind="stable")] = np.arange(count)
-    placed = np.empty_like(vertices)
-    placed[rank] = vertices
-    return replace(mesh, vertices=placed, faces=rank[label].reshape(-1, 3).astype(np.int64))
+    first = np.full(count, n, np.int64)
+    np.minimum.at(first, label, f.ravel())
+    rank = np.argsort(np.argsort(first, kind="stable"))  # the file's order, where nothing was cut
+    faces, vertices = rank[label].reshape(-1, 3), np.empty((count, 3))
+    vertices[faces] = mesh.vertices[f]
+    return replace(mesh, vertices=vertices, faces=faces)

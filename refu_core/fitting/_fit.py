@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError, require_type
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
-from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.fitting._pieces import apart, outer_sides, slivers, unsewn, without_bodies, without_floor, without_specks
 from refu_core.fitting._place import Place, find_places
 from refu_core.fitting._placing import UNITS, Placing
@@ -22,9 +21,6 @@ from refu_core.fitting._transfer import Transfer
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentCard, GarmentTemplate, require_name
 from refu_core.mesh import Connectivity, face_normals
-
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 HOLDS: tuple[str, ...] = ("waist", "shoulders")
 LONGEST_EDGE = 0.02

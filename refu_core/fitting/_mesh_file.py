@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from refu_core._files import parse_json, read_file
 from refu_core.errors import GarmentError
 from refu_core.garments import UvMap
+
+F64 = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 MESH_SUFFIXES: tuple[str, ...] = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 """Files that are read."""
@@ -43,27 +46,38 @@ class SurfaceMesh:
     Raises `GarmentError` for arrays of another kind, for no faces, and for faces with vertices that don't exist.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: F64
     """Shape (V, 3)."""
-    faces: NDArray[np.int64]
+    faces: Ints
     """Shape (F, 3)."""
     uv: UvMap | None = None
 
     def __post_init__(self) -> None:
         try:
-            object.__setattr__(self, "vertices", np.asarray(self.vertices, np.float64).reshape(-1, 3))
-            faces = np.asarray(self.faces).astype(np.int64, casting="same_kind")
-            object.__setattr__(self, "faces", faces.reshape(-1, 3))
-            _check(self)
+            v = np.asarray(self.vertices, np.float64).reshape(-1, 3)
+            f = np.asarray(self.faces).astype(np.int64, casting="same_kind").reshape(-1, 3)
         except (TypeError, ValueError) as error:
             raise GarmentError(str(error)) from error
+        vars(self).update(vertices=v, faces=f)
+        if not len(f):
+            raise GarmentError("it has no faces")
+        if f.min() < 0 or f.max() >= len(v):
+            raise GarmentError(f"a face names vertex {f.max() + 1} of {len(v)}")
+        if not np.isfinite(v[f]).all():
+            raise GarmentError("it has vertices that are NaN or infinite")
+        largest, extent = float(np.abs(v[f]).max()), float(np.ptp(v[f].reshape(-1, 3), axis=0).max())
+        if largest > _SIZES[1] or extent < _SIZES[0]:
+            wanted = f"wanted sizes from {_SIZES[0]:g} to {_SIZES[1]:g}"
+            raise GarmentError(f"it is {extent:.3g} large and reaches to {largest:.3g}: {wanted}")
+        if self.uv is not None and (self.uv.faces.min() < 0 or self.uv.faces.max() >= len(self.uv.coordinates)):
+            raise GarmentError("a face names texture coordinates that there aren't")
 
     def only(self, kept: NDArray[np.bool_]) -> SurfaceMesh:
         """The mesh of some of its faces, a mask (F,)."""
         uv = None if self.uv is None else replace(self.uv, faces=self.uv.faces[kept])
         return SurfaceMesh(self.vertices, self.faces[kept], uv)
 
-    def compact(self, faces: NDArray[np.int64] | None = None) -> SurfaceMesh:
+    def compact(self, faces: Ints | None = None) -> SurfaceMesh:
         """The mesh without vertices that no face uses; if given, `faces` (F, 3) take the place of its own."""
         used, local = np.unique(self.faces if faces is None else faces, return_inverse=True)
         return replace(self, vertices=self.vertices[used], faces=local.reshape(-1, 3).astype(np.int64))
@@ -83,7 +97,7 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
     try:
         with np.errstate(all="ignore"):  # numbers that aren't finite are refused below
             mesh = _parse_obj(content) if suffix == ".obj" else _by_trimesh(content, suffix)
-        _require_few(len(mesh.faces))
+        _require_few(len(mesh.faces), *_TRIANGLES)
     except ImportError:
         raise
     except Exception as error:  # trimesh may raise anything for a damaged file
@@ -91,30 +105,13 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
     return mesh
 
 
-def _require_few(n_triangles: int) -> None:
-    if n_triangles > _MAX_FACES:
-        raise ValueError(f"it has {n_triangles} triangles or more, at most {_MAX_FACES} are read: decimate it")
+_TRIANGLES = "triangles or more", _MAX_FACES, "decimate it"
+_PIECES = "pieces", _MAX_PARTS, "join them to one"
 
 
-def _require_few_parts(n_parts: int) -> None:
-    if n_parts > _MAX_PARTS:
-        raise ValueError(f"it has {n_parts} pieces, at most {_MAX_PARTS} are read: join them to one")
-
-
-def _check(mesh: SurfaceMesh) -> None:
-    v, f = mesh.vertices, mesh.faces
-    if not len(f):
-        raise ValueError("it has no faces")
-    if f.min() < 0 or f.max() >= len(v):
-        raise ValueError(f"a face names vertex {f.max() + 1} of {len(v)}")
-    if not np.isfinite(v[f]).all():
-        raise ValueError("it has vertices that are NaN or infinite")
-    largest, extent = float(np.abs(v[f]).max()), float(np.ptp(v[f].reshape(-1, 3), axis=0).max())
-    if largest > _SIZES[1] or extent < _SIZES[0]:
-        msg = f"it is {extent:.3g} large and reaches to {largest:.3g}: wanted sizes from {_SIZES[0]:g} to {_SIZES[1]:g}"
-        raise ValueError(msg)
-    if mesh.uv is not None and (mesh.uv.faces.min() < 0 or mesh.uv.faces.max() >= len(mesh.uv.coordinates)):
-        raise ValueError("a face names texture coordinates that there aren't")
+def _require_few(n: int, what: str, most: int, advice: str) -> None:
+    if n > most:
+        raise ValueError(f"it has {n} {what}, at most {most} are read: {advice}")
 
 
 def _parse_obj(content: bytes) -> SurfaceMesh:
@@ -122,7 +119,7 @@ def _parse_obj(content: bytes) -> SurfaceMesh:
     coordinates: list[list[float]] = []
     corners: list[list[tuple[int, int]]] = []
     count = 0
-    _require_few(content.count(b"\nf "))  # before its vertices are read
+    _require_few(content.count(b"\nf "), *_TRIANGLES)  # before its vertices are read
     text = content.decode("utf-8-sig", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         kind, *words = line.partition("#")[0].split() or [""]
@@ -137,7 +134,7 @@ def _parse_obj(content: bytes) -> SurfaceMesh:
                 count += max(0, len(words) - 2)
         except (ValueError, IndexError) as error:
             raise ValueError(f"line {number}: {line[:60]!r}") from error
-        _require_few(count)
+        _require_few(count, *_TRIANGLES)
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     triangles = _triangles(corners, points)
     uv = None
@@ -160,7 +157,7 @@ def _corner(word: str, n_vertices: int, n_coordinates: int) -> tuple[int, int]:
     return found[0], found[1]
 
 
-def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64]) -> NDArray[np.int64]:
+def _triangles(polygons: list[list[tuple[int, int]]], points: F64) -> Ints:
     """Polygons as triangles, in order, (T, 3, 2): quads are cut along the shorter diagonal, others by ears."""
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
     if len(sizes) and sizes.max() > _MAX_CORNERS:
@@ -184,47 +181,38 @@ def _triangles(polygons: list[list[tuple[int, int]]], points: NDArray[np.float64
     return np.concatenate([corners for _, corners in found])[order]
 
 
-def _cut_quads(places: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _cut_quads(places: F64) -> tuple[NDArray[np.bool_], Ints]:
     """Which of quads (Q, 4, 3) are convex, and the corners of their halves, (Q, 2, 3), along the shorter diagonal."""
     before, after = np.roll(places, 1, axis=1), np.roll(places, -1, axis=1)
     normal = np.cross(places, after).sum(axis=1)
     turns = (np.cross(places - before, after - places) * normal[:, None]).sum(2)
     diagonal = np.square(after - before).sum(2)
     first = (diagonal[:, 0] <= diagonal[:, 1])[:, None, None]
-    cuts: NDArray[np.int64] = np.where(first, [[3, 0, 1], [1, 2, 3]], [[0, 1, 2], [0, 2, 3]])
+    cuts: Ints = np.where(first, [[3, 0, 1], [1, 2, 3]], [[0, 1, 2], [0, 2, 3]])
     return (turns > 0).all(axis=1), cuts
 
 
-def _ears(places: NDArray[np.float64]) -> Iterable[tuple[int, int, int]]:
+def _ears(places: F64) -> Iterator[tuple[int, int, int]]:
     """Triangles of a polygon (N, 3), convex or not: cuts off corners that hold no other one, shortest cut first."""
     normal = np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0)
     left = list(range(len(places)))
     while len(left) > 3:
-        before, here, after = (places[np.roll(left, shift)] for shift in (1, 0, -1))
-        cut = after - before
+        corners = np.stack([places[np.roll(left, shift)] for shift in (1, 0, -1)], axis=1)
+        before, here, after = corners.swapaxes(0, 1)
         turns = np.cross(here - before, after - here) @ normal
-        length = np.square(cut).sum(axis=1) + np.where(turns > 0, 0.0, np.inf)
-        chosen = int(length.argmin())
-        for k in np.argsort(length, kind="stable"):
-            if not np.isfinite(length[k]):
-                break
-            if not _holds(before[k], here[k], after[k], places[left], normal):
-                chosen = int(k)
-                break
+        length = np.square(after - before).sum(axis=1) + np.where(turns > 0, 0.0, np.inf)
+        order = [k for k in np.argsort(length, kind="stable").tolist() if np.isfinite(length[k])]
+        ears = (k for k in order if not _holds(corners[k], places[left], normal))
+        chosen = next(ears, int(length.argmin()))
         yield left[chosen - 1], left[chosen], left[(chosen + 1) % len(left)]
         del left[chosen]
     yield left[0], left[1], left[2]
 
 
-def _holds(
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    c: NDArray[np.float64],
-    points: NDArray[np.float64],
-    normal: NDArray[np.float64],
-) -> bool:
-    """Whether a triangle, seen along a normal, has any of the points (N, 3) inside."""
-    sides = np.stack([np.cross(q - p, points - p) @ normal for p, q in ((a, b), (b, c), (c, a))])
+def _holds(triangle: F64, points: F64, normal: F64) -> bool:
+    """Whether a triangle (3, 3), seen along a normal, has any of the points (N, 3) inside."""
+    ends = zip(triangle, np.roll(triangle, -1, axis=0), strict=True)
+    sides = np.stack([np.cross(q - p, points - p) @ normal for p, q in ends])
     return bool((sides > 1e-9 * np.abs(sides).max(initial=0.0)).all(axis=0).any())
 
 
@@ -234,7 +222,7 @@ def _by_trimesh(content: bytes, suffix: str) -> SurfaceMesh:
     if suffix.startswith(".gl"):
         content = _lean(content)
     elif suffix == ".stl":
-        _require_few_parts(content.count(b"endsolid"))
+        _require_few(content.count(b"endsolid"), *_PIECES)
     scene = trimesh.load_scene(io.BytesIO(content), file_type=suffix[1:], process=False)
     parts = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     if not parts:
@@ -269,14 +257,14 @@ def _lean(content: bytes) -> bytes:
         part["attributes"] = _of(part["attributes"], "POSITION", "TEXCOORD_0")
     placed = "children", "mesh", "matrix", "rotation", "scale", "translation"
     nodes = [_of(node, *placed) for node in tree.get("nodes", ())]
-    if len(nodes) > _MAX_NODES:
-        raise ValueError(f"it has {len(nodes)} nodes, at most {_MAX_NODES} are read: leave out what isn't cloth")
+    _require_few(len(nodes), "nodes", _MAX_NODES, "leave out what isn't cloth")
     accessors = tree.get("accessors", ())
     for some in (parts, [part for node in nodes if "mesh" in node for part in meshes[node["mesh"]]]):
-        _require_few_parts(len(some))
-        _require_few(sum(abs(accessors[part["indices"]]["count"]) for part in some if "indices" in part) // 3)
-        if (n := sum(abs(accessors[i]["count"]) for part in some for i in part["attributes"].values())) > _MAX_VERTICES:
-            raise ValueError(f"its pieces have {n} vertices, at most {_MAX_VERTICES} are read: join them to one")
+        _require_few(len(some), *_PIECES)
+        n_corners = sum(abs(accessors[part["indices"]]["count"]) for part in some if "indices" in part)
+        _require_few(n_corners // 3, *_TRIANGLES)
+        n_vertices = sum(abs(accessors[i]["count"]) for part in some for i in part["attributes"].values())
+        _require_few(n_vertices, "vertices in its pieces", _MAX_VERTICES, "join them to one")
     used = {i for part in parts for i in (part.get("indices"), *part["attributes"].values())}
     nothing = {"componentType": 5126, "count": 0, "type": "SCALAR"}
     lean = _of(tree, "asset", "scene", "scenes", "buffers", "bufferViews") | {

@@ -5,20 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from refu_core.body import JOINT_NAMES
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import clean, components, partners, rim_vertices
-from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._surround import sample
 from refu_core.frames import N_JOINTS
 from refu_core.mesh import Connectivity, face_normals, linked
-
-F64 = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _ENDS = tuple(JOINT_NAMES.index(name) for name in ("head", "left_hand", "right_hand", "left_foot", "right_foot"))
 _ON_SKIN = 0.02

@@ -15,14 +15,11 @@ from scipy.optimize import minimize
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import no_opening
-from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._mesh_file import F64, SurfaceMesh
 from refu_core.fitting._placing import UNITS, Placing
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
-from refu_core.fitting._shifts import HIGHEST, LIFTS, heights, shifts
 from refu_core.fitting._surround import NEAR, Fit, Samples, fits_of, lies_over, parts_legs, sample
-from refu_core.fitting._turns import LYING, is_sideways_turn, turns_of
-
-F64 = NDArray[np.float64]
+from refu_core.fitting._ways import HIGHEST, LIFTS, LYING, heights, is_sideways_turn, shifts, turns_of
 
 _SIZES = (0.12, 2.1)
 """The largest extent of a garment [m]: from a sock to a gown with a train."""
@@ -64,17 +61,17 @@ class Place:
     unit: float
     turn: F64
     """Rotation, shape (3, 3)."""
+    kind: str
+    """How it was placed: as it is (empty), moved from a `floor`, or `searched`."""
     shift: F64
     """[m], shape (3,)."""
+    lift: float
+    """How much higher it is than by convention [m]: its wearer, or the origin of their model, was another."""
     pose: F64
     """Rotation vectors [rad], shape (24, 3)."""
     fit: Fit
     top: float
     """How high the mesh reaches [m]."""
-    kind: str
-    """How it was placed: as it is (empty), moved from a `floor`, or `searched`."""
-    lift: float = 0.0
-    """How much higher it is than by convention [m]: its wearer, or the origin of their model, was another."""
     notes: list[str] = field(default_factory=list)
     """What was found out, one sentence each."""
 
@@ -329,7 +326,7 @@ class _Search:
 
 
 class _Way(NamedTuple):
-    """A way to place a mesh; the fields are those of `Place`."""
+    """A way to place a mesh; the fields are the first ones of `Place`."""
 
     unit: float
     turn: F64
@@ -346,10 +343,7 @@ def _at(samples: Samples, ways: Sequence[_Way], body: PosedBody) -> list[Place]:
     normals = np.stack([samples.normals @ way.turn.T for way in ways])
     area = np.array([[way.unit**2] for way in ways]) * samples.area
     fits, tops = fits_of(points, normals, area, samples, body), points[:, :, 1].max(1).tolist()
-    return [
-        Place(way.unit, way.turn, way.shift, body.pose, fit, top, way.kind, way.lift)
-        for way, fit, top in zip(ways, fits, tops, strict=True)
-    ]
+    return [Place(*way, body.pose, fit, top) for way, fit, top in zip(ways, fits, tops, strict=True)]
 
 
 def _told(place: Place) -> Place:

@@ -6,12 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from refu_core.errors import GarmentError
+from refu_core.fitting._mesh_file import F64
 from refu_core.frames import N_JOINTS
-
-F64 = NDArray[np.float64]
 
 UNITS: dict[str, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres of a unit."""

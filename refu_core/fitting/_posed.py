@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from refu_core.body import JOINT_NAMES, SmplBody
+from refu_core.fitting._mesh_file import F64, Ints
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.mesh import vertex_areas
 from refu_core.sdf import ExactSdf
-
-F64 = NDArray[np.float64]
 
 LEFT_SHOULDER, RIGHT_SHOULDER = (JOINT_NAMES.index(f"{side}_shoulder") for side in ("left", "right"))
 LEFT_ELBOW, RIGHT_ELBOW = (JOINT_NAMES.index(f"{side}_elbow") for side in ("left", "right"))
@@ -43,7 +41,7 @@ class PosedBody:
         found = self._sdf.query(torch.as_tensor(points, dtype=torch.float32))
         return found.distance.double().numpy(), found.gradient.double().numpy()
 
-    def closest(self, points: F64) -> tuple[NDArray[np.int64], F64]:
+    def closest(self, points: F64) -> tuple[Ints, F64]:
         """The closest face of each point (P, 3), and where in it that is, as barycentric coordinates (P, 3)."""
         found = self._sdf.closest(torch.as_tensor(points, dtype=torch.float32))
         return found.face.long().numpy(), found.barycentrics.double().numpy()

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 from refu_core.body import SmplBody
 from refu_core.fitting._clean import components, rim_vertices
-from refu_core.fitting._mesh_file import SurfaceMesh
+from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.mesh import face_normals
-
-F64 = NDArray[np.float64]
 
 NEAR = 0.06
 """Cloth nearer than this on average lies on the skin, like a glove [m]; cloth that is worn farther off is wide."""
@@ -102,7 +100,7 @@ class Samples(NamedTuple):
     """Unit, shape (P, 3)."""
     is_open: NDArray[np.bool_]
     """Whether it is on a piece with a rim; a closed piece is cloth with both its sides, shape (P,)."""
-    piece: NDArray[np.int64]
+    piece: Ints
     """The piece that it is on, shape (P,)."""
     area: F64
     """Area of the surface that each point stands for, shape (P,)."""
@@ -178,7 +176,7 @@ def _around(
     return float(each * skin_area[::each][np.abs(winding) > 0.4].sum() / shares.sum())
 
 
-def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
+def parts_legs(vertices: F64, faces: Ints, body: SmplBody) -> bool:
     """Whether cloth of vertices (V, 3) [m] passes between the legs of a body; a skirt says nothing about them."""
     joints = body.joint_template.double().numpy()
     left, right = (
@@ -188,7 +186,7 @@ def parts_legs(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
     return _crosses(vertices, faces, left, right - left)
 
 
-def lies_over(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
+def lies_over(vertices: F64, faces: Ints, body: SmplBody) -> bool:
     """Whether cloth of vertices (V, 3) [m] lies over the shoulders of a body, at any height: a skirt doesn't."""
     neck, *shoulders = body.joint_template[[12, 16, 17]].double().numpy()
     over = np.concatenate([neck + _DOWN[:, None] * (shoulder - neck) for shoulder in shoulders])
@@ -197,7 +195,7 @@ def lies_over(vertices: F64, faces: NDArray[np.int64], body: SmplBody) -> bool:
     return _crosses(vertices, faces, over, np.tile([0.0, high - low, 0.0], (len(over), 1)))
 
 
-def _crosses(vertices: F64, faces: NDArray[np.int64], starts: F64, ways: F64) -> bool:
+def _crosses(vertices: F64, faces: Ints, starts: F64, ways: F64) -> bool:
     """Whether cloth lies across a line that begins at one of the starts (N, 3) and goes its way (N, 3)."""
     first, second, third = (vertices[faces[:, k]] for k in range(3))
     low, high = (most(most(first, second), third).T.copy() for most in (np.minimum, np.maximum))

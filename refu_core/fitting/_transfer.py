@@ -22,10 +22,9 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.spatial import cKDTree
 
 from refu_core.fitting._clean import components, rim_vertices
+from refu_core.fitting._mesh_file import F64, Ints
 from refu_core.fitting._posed import PosedBody
 from refu_core.mesh import symmetric_solver, vertex_areas, vertex_normals
-
-F64 = NDArray[np.float64]
 
 _FARTHEST = 0.15
 """Skin farther off than this isn't trusted [m]."""
@@ -45,7 +44,7 @@ _OF_ITS_OWN = 0.05
 class Transfer:
     """From the skin to a garment's V vertices."""
 
-    face: NDArray[np.int64]
+    face: Ints
     """The closest face of the body, shape (V,)."""
     barycentric: F64
     """Where in it, shape (V, 3)."""
@@ -53,7 +52,7 @@ class Transfer:
     """How far off the skin, negative inside [m], shape (V,)."""
     is_trusted: NDArray[np.bool_]
     """Whether that skin is near and faces the way the cloth does, shape (V,)."""
-    body_faces: NDArray[np.int64]
+    body_faces: Ints
     mass: F64
     """Area of each vertex [m²], shape (V,)."""
     laplacian: csc_array
@@ -62,7 +61,7 @@ class Transfer:
     """Vertices of the pieces that don't bend."""
 
     @classmethod
-    def of(cls, vertices: F64, faces: NDArray[np.int64], body: PosedBody) -> Transfer:
+    def of(cls, vertices: F64, faces: Ints, body: PosedBody) -> Transfer:
         """For a garment of vertices (V, 3) [m] and faces (F, 3), outward, on a posed body."""
         distance, gradient = body(vertices)
         face, barycentric = body.closest(vertices)
@@ -102,27 +101,19 @@ class Transfer:
         return found
 
 
-def _laplacian(v: F64, f: NDArray[np.int64], seams: NDArray[np.int64]) -> csc_array:
+def _laplacian(v: F64, f: Ints, seams: Ints) -> csc_array:
     """Cotangents where they are positive, a tenth of an equilateral triangle's elsewhere; seams as firm as edges."""
-    n = len(v)
-    rows: list[NDArray[Any]] = []
-    weights = []
-    for k in range(3):
-        a, b, c = f[:, k], f[:, (k + 1) % 3], f[:, (k + 2) % 3]
-        u, w = v[a] - v[c], v[b] - v[c]
-        cross = np.linalg.norm(np.cross(u, w), axis=1)
-        cotangent = (u * w).sum(1) / np.maximum(cross, 1e-12)
-        rows.append(np.stack((a, b), 1))
-        weights.append(0.5 * np.clip(cotangent, 0.06, 10.0))
-    rows.append(seams)
-    weights.append(np.ones(len(seams)))
-    pairs, weight = np.concatenate(rows), np.concatenate(weights)
-    adjacent = coo_array((weight, (pairs[:, 0], pairs[:, 1])), shape=(n, n)).tocsr()
+    starts, ends, opposite = f.T, np.roll(f, -1, axis=1).T, np.roll(f, 1, axis=1).T
+    u, w = v[starts] - v[opposite], v[ends] - v[opposite]
+    cotangent = (u * w).sum(2) / np.maximum(np.linalg.norm(np.cross(u, w), axis=2), 1e-12)
+    weight = np.append(0.5 * np.clip(cotangent, 0.06, 10.0), np.ones(len(seams)))
+    pairs = np.append(starts, seams[:, 0]), np.append(ends, seams[:, 1])
+    adjacent = coo_array((weight, pairs), shape=(len(v), len(v))).tocsr()
     adjacent = adjacent + adjacent.T
     return csc_array(diags_array(adjacent.sum(axis=1)) - adjacent)
 
 
-def _seams(v: F64, label: NDArray[np.int64], rim: NDArray[np.int64], is_led: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _seams(v: F64, label: Ints, rim: Ints, is_led: NDArray[np.bool_]) -> Ints:
     """Pairs of vertices that move together: touching rims of two pieces, and each piece that is led with the nearest.
 
     Pieces with skin of their own aren't tied to each other: two gloves follow two hands.

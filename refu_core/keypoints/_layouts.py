@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,5 +129,5 @@ def _twin(words: tuple[str, ...], i: int) -> int:
     if word[:2] not in ("l_", "r_"):
         return i
     other = ("r_" if word[0] == "l" else "l_") + word[2:]
-    rank = words[:i].count(word)
-    return next(islice((j for j, found in enumerate(words) if found == other), rank, None), i)
+    same, rank = [j for j, found in enumerate(words) if found == other], words[:i].count(word)
+    return same[rank] if rank < len(same) else i

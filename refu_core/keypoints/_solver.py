@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.spatial.transform import Rotation
 
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3, skew
+from refu_core.keypoints._pose import Array, Pose, Skeleton, log_so3, skew
 from refu_core.skeleton import JOINT_NAMES, PARENTS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,56 +256,28 @@ def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start
     root = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     turns = start.turns.copy()
     turns[0] = root
-    pose = Pose(centre[1] + root @ (upright.pelvis - centre[0]), turns, start.betas)
     bones = skeleton.bones(start.betas)
+    pelvis = centre[1] + root @ (upright.pelvis - centre[0])
+    world = skeleton.posed(Pose(pelvis, turns, start.betas)).turns
     for ball, hinge, end, bends in _LIMBS:
         at = [skeleton.layout.at_joint(joint) for joint in (ball, hinge, end)]
         if at[0] < 0 or at[1] < 0 or not (seen[at[0]] and seen[at[1]]):
             continue
-        above = _turn_above(turns, ball)
+        above = world[PARENTS[ball]]
         upper = above.T @ (points[at[1]] - points[at[0]])
         lower = above.T @ (points[at[2]] - points[at[1]]) if at[2] >= 0 and seen[at[2]] else np.zeros(3)
-        if np.linalg.norm(upper) < _LEAST:
+        lengths = np.linalg.norm(upper), np.linalg.norm(lower)
+        if lengths[0] < _LEAST:
             continue
-        turns[ball] = _aligned(bones[hinge], np.array([0, 0, bends]), upper, lower)
-        if np.linalg.norm(lower) >= _LEAST:
-            turns[hinge] = _shortest(bones[end], turns[ball].T @ lower)
-    return pose
+        has_end = lengths[1] >= _LEAST
+        is_bent = has_end and np.linalg.norm(np.cross(upper, lower)) >= _BENT * lengths[0] * lengths[1]
+        n = 2 if is_bent else 1
+        turns[ball] = _aligned([bones[hinge], np.array([0, 0, bends])][:n], [upper, lower][:n])
+        if has_end:
+            turns[hinge] = _aligned([bones[end]], [turns[ball].T @ lower])
+    return Pose(pelvis, turns, start.betas)
 
 
-def _turn_above(turns: Array, joint: int) -> Array:
-    """Rotation of a joint's parent in the world."""
-    turn = np.eye(3)
-    while (joint := PARENTS[joint]) >= 0:
-        turn = turns[joint] @ turn
-    return turn
-
-
-def _unit(vector: Array) -> Array:
-    return vector / max(float(np.linalg.norm(vector)), 1e-9)
-
-
-def _shortest(start: Array, end: Array) -> Array:
-    """The smallest rotation from one direction to another."""
-    a, b = _unit(start), _unit(end)
-    axis = np.cross(a, b)
-    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
-    if sine < 1e-9:  # the same direction, or the opposite one: any perpendicular axis will do
-        axis = _unit(np.cross(a, np.eye(3)[np.abs(a).argmin()]))
-    angle = np.arctan2(sine, cosine)
-    turn: Array = exp_so3(_unit(axis)[None] * angle)[0]
-    return turn
-
-
-def _aligned(bone: Array, bend: Array, upper: Array, lower: Array) -> Array:
-    """The rotation of a bone onto `upper` that bends the limb towards `lower`, if the bend shows."""
-    along = _unit(upper)
-    side = _unit(lower) - (_unit(lower) @ along) * along
-    if np.linalg.norm(side) < _BENT:
-        return _shortest(bone, upper)
-    first = _unit(bone)
-    across = _unit(bend - (bend @ first) * first)
-    before = np.stack([first, across, np.cross(first, across)], axis=1)
-    side = _unit(side)
-    result: Array = np.stack([along, side, np.cross(along, side)], axis=1) @ before.T
-    return result
+def _aligned(before: list[Array], after: list[Array]) -> Array:
+    """The smallest rotation of one direction onto another (3,); with two of each, the second is only turned towards."""
+    return Rotation.align_vectors(after, before, weights=[np.inf, 1.0][: len(before)])[0].as_matrix()

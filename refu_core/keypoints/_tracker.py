@@ -14,14 +14,12 @@ from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
-from refu_core.keypoints._pose import Pose, Skeleton, exp_so3, log_so3
+from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3
 from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, Solver, TrackerSettings, first_pose
-
-Array = NDArray[np.float64]
 
 DEFAULTS = TrackerSettings()
 

@@ -240,8 +240,7 @@ class ObservedCloth:
     @property
     def offset(self) -> F32:
         """The displacement that is added to the garment before it is posed [m], shape (V, 3)."""
-        found: F32 = self._lift[:, None] * self._out
-        return found
+        return self._lift[:, None] * self._out
 
     def place(self, vertices: F32) -> None:
         """Takes over where the garment's vertices are [m], shape (V, 3)."""

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core._files import read_file
@@ -21,9 +20,7 @@ from refu_core.keypoints import Proportions
 from refu_core.recordings._followed import follow, metres_of
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps
-from refu_core.recordings._upright import Axes
-
-Array = NDArray[np.float64]
+from refu_core.recordings._upright import Array, Axes
 
 _MAX_BYTES = 256 << 20
 _MAX_JOINTS = 1000

@@ -136,19 +136,29 @@ def _is_list(value: Any) -> bool:
     return isinstance(value, (list, tuple))
 
 
-def entries(value: Any) -> Mapping[Key, Any] | None:
-    """The entries of a mapping, an object's attributes, or the items of a list of these; None for anything else."""
+def entries(value: Any, depth: int = MOST_DEPTH) -> Mapping[Key, Any] | None:
+    """The entries of a mapping, an object's attributes, or the items of a list of these; None for anything else.
+
+    Lists may be in lists, so many levels deep.
+    """
+    value = held_by(value)
     if isinstance(value, dict):
         return value
     if isinstance(value, Record):
-        if value.kind == "array" and isinstance(value.state, tuple) and len(value.state) == 5:
-            held = value.state[4]  # an array of objects: NumPy's way to save a dictionary
-            return entries(held[0] if len(held) == 1 else held) if isinstance(held, list) and held else None
         state = value.items or value.state
         return state if value.kind == "foreign" and isinstance(state, dict) else None
-    if _is_list(value) and value and all(isinstance(item, (dict, Record)) for item in value[:1]):
-        return dict(enumerate(value)) if entries(value[0]) is not None else None
-    return None
+    is_list = depth > 0 and _is_list(value) and value and isinstance(value[0], (dict, Record))
+    return dict(enumerate(value)) if is_list and entries(value[0], depth - 1) is not None else None
+
+
+def held_by(value: Any) -> Any:
+    """What an array of objects holds, which is how NumPy saves a dictionary or a list; any other value is itself."""
+    for _ in range(MOST_DEPTH):  # one that holds itself would never end
+        state = value.state if isinstance(value, Record) and value.kind == "array" else None
+        if not (isinstance(state, tuple) and len(state) == 5 and isinstance(state[4], list)):
+            break
+        value = state[4][0] if len(state[4]) == 1 else state[4]
+    return value
 
 
 def words_of(value: Any) -> Sequence[str]:

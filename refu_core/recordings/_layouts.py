@@ -45,6 +45,11 @@ class Layout:
     turns_about_origin: bool = False
     """Whether the root turns the body about the origin of its mesh instead of its pelvis."""
 
+    @property
+    def arrays(self) -> tuple[str, ...]:
+        """Names that its arrays may have."""
+        return (*self.pose, *self.transl, *self.betas)
+
     def is_in(self, node: Mapping[Any, Any]) -> bool:
         """Whether a mapping has all arrays of the pose."""
         return all(node.get(name) is not None for name in self.pose)
@@ -126,10 +131,9 @@ COLUMNS = (*FRAME_NUMBERS, *IMAGES, *PERSONS, *GENDERS)
 
 POSE_KEYS = frozenset(name for layout in LAYOUTS if layout.is_whole for name in layout.pose)
 """Names of the arrays of whole poses."""
-ALL_KEYS = frozenset(
-    {name for layout in LAYOUTS for names in (layout.pose, layout.transl, layout.betas) for name in names}
-    | {*RATES, *COLUMNS, LENGTHS, *SCALINGS, *MODELS, *_SOMA}
-)
+ARRAYS = tuple(dict.fromkeys(name for layout in LAYOUTS for name in layout.arrays))
+"""Names of all arrays of poses, translations and shapes."""
+ALL_KEYS = frozenset((*ARRAYS, *RATES, *COLUMNS, LENGTHS, *SCALINGS, *MODELS, *_SOMA))
 """Names of everything that is read; all else in a file, such as meshes and pictures, is left unread."""
 
 

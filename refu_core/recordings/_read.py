@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from refu_core.errors import RefuError
 from refu_core.frames import N_JOINTS
@@ -23,7 +24,7 @@ from refu_core.recordings._soma import smpl_of_soma
 from refu_core.recordings._tables import numbers_of
 from refu_core.recordings._tracks import filled, places_in_time
 from refu_core.recordings._upright import AXES, PELVIS, PELVIS_OF_SMPLX, Axes, to_smpl
-from refu_core.recordings._values import betas_of, fps_of, gender_of, transl_of, turned, word_of
+from refu_core.recordings._values import betas_of, fps_of, gender_of, transl_of, word_of
 
 _SMPLH_JOINTS, _SMPLX_JOINTS = 52, 55
 _BODY_JOINTS = 22  # what SMPL, SMPL-H and SMPL-X share; SMPL's two hand joints have no counterpart in the others
@@ -150,7 +151,7 @@ def _recording(
         notes.append("betas are SMPL-X's: another shape space than SMPL's")
     theirs = PELVIS_OF_SMPLX if is_smplx and transl.any() and not is_low else pelvis
     if layout.turns_about_origin:
-        transl = transl + turned(theirs, poses[:, 0]) - pelvis
+        transl = transl + Rotation.from_rotvec(poses[:, 0]).apply(theirs) - pelvis  # NaN for a root that is
     elif theirs is not pelvis:
         transl = transl + theirs - pelvis
     if theirs is not pelvis:

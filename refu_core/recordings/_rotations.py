@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.keypoints import LAYOUTS, keypoint_layout
-
-Array = NDArray[np.float64]
+from refu_core.recordings._upright import Array
 
 WHOLE = (24, 22, 52, 55)
 """Numbers of joints, root included: of SMPL, of its body without hands, of SMPL-H, of SMPL-X."""
 BODY = (23, 21, 51, 54)
 """The same without the root."""
-_FORMS = {3: "rotation vectors", 9: "matrices", 6: "6D rotations", 4: "quaternions"}
+_FORMS: dict[int, tuple[tuple[int, ...], ...]] = {3: ((3,),), 9: ((9,), (3, 3)), 6: ((6,),), 4: ((4,),)}
+"""How rotation vectors, matrices, 6D rotations and quaternions may be laid out, by their numbers."""
 _N_LATENT = 32
 """Numbers of VPoser's latent pose [1]."""
 _ADVICE = {
@@ -59,9 +59,13 @@ def is_one_frame(shape: tuple[int, ...], counts: Collection[int]) -> bool:
     """Whether an array of this shape is one frame of one of these numbers of joints, in any form."""
     while len(shape) > 1 and shape[0] == 1:
         shape = shape[1:]
-    forms = {(n, *form) for n in counts for form in ((3,), (6,), (9,), (3, 3))}
-    forms |= {(int(np.prod(form)),) for form in forms}
+    forms = {form for n in counts for size in (3, 6, 9) for form in _laid_out(n, size)}
     return shape in forms or (1, *shape) in forms
+
+
+def _laid_out(n: int, size: int) -> list[tuple[int, ...]]:
+    """The shapes of one frame of n rotations of so many numbers each."""
+    return [(n * size,), *((n, *form) for form in _FORMS[size])]
 
 
 def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int, int, int]:
@@ -74,19 +78,18 @@ def _form(array: NDArray[Any], name: str, counts: Collection[int]) -> tuple[int,
         inner = inner[1:]
     found: list[tuple[int, int, int]] = []
     for n in counts:
-        for size in _FORMS:
-            ways: list[tuple[int, ...]] = [(n * size,), (n, size)]
-            ways += [(n, 3, 3), (n * 9,)] if size == 9 else []
-            ways += [(3, 3)] if size == 9 and n == 1 else []
+        for size, forms in _FORMS.items():
+            ways = [*_laid_out(n, size), *(forms if n == 1 else ())]
             if inner in ways:
                 found.append((size, n, shape[0]))
             elif shape in ways:
                 found.append((size, n, 1))
     if not found or not array.size:
         per, advice = " | ".join(str(n) for n in counts), _advice(shape)
-        forms = "(T, n, 3) or (T, n*3) rotation vectors [rad], (T, n, 3, 3) or (T, n*9) matrices, "
-        forms += f"or (T, n, 6) or (T, n*6), with T > 0 and n = {per} joints"
-        wanted = f"rotations of n = {per} joints" if advice else forms
+        wanted = f"rotations of n = {per} joints"
+        if not advice:
+            wanted = "(T, n, 3) or (T, n*3) rotation vectors [rad], (T, n, 3, 3) or (T, n*9) matrices, "
+            wanted += f"or (T, n, 6) or (T, n*6), with T > 0 and n = {per} joints"
         raise ValueError(f"{name} must be {wanted}, got {shape}{advice}")
     # (24, 3) is one frame of SMPL: for 24 frames of a root, the caller would have asked for the count 1.
     return next((form for form in found if form[0] != 4), found[0])

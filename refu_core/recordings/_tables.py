@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -153,14 +154,8 @@ def _tracks(
 def _split(content: Content, node: Mapping[Key, Any], n: int) -> dict[Key, NDArray[Any]]:
     """The arrays that have a row for each of n; betas (n,) are one person's, even of ten."""
     arrays: dict[Key, NDArray[Any]] = {}
-    for layout in table.LAYOUTS:
-        for name in (*layout.pose, *layout.transl, *layout.betas):
-            if node.get(name) is None or name in arrays:
-                continue
-            try:
-                array = content.array(node[name])
-            except ValueError:
-                continue
-            if array.ndim > 1 and len(array) == n:
+    for name in table.ARRAYS:
+        with contextlib.suppress(ValueError):
+            if node.get(name) is not None and (array := content.array(node[name])).ndim > 1 and len(array) == n:
                 arrays[name] = array
     return arrays

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from refu_core._pickle_machine import Record
 from refu_core.recordings import _layouts as table
-from refu_core.recordings._containers import MOST_DEPTH, Content, Key, entries
+from refu_core.recordings._containers import MOST_DEPTH, Content, Key, entries, held_by
 from refu_core.recordings._recording import MAX_FRAMES, interpolated
 from refu_core.recordings._rotations import is_one_frame
 
@@ -124,16 +124,14 @@ def _rows(content: Content, seen: Mapping[Key, Any]) -> Any:
     if layout is None or _layout_of(content, seen) is not None:
         return seen
     n = len(content.array(seen[layout.pose[0]]))
-    names = (*layout.pose, *layout.transl, *layout.betas, *table.TRACK_IDS, "track_ids")
+    names = (*layout.arrays, *table.TRACK_IDS, "track_ids")
     arrays = {name: content.array(seen[name]) for name in names if seen.get(name) is not None}
     split = {name: array for name, array in arrays.items() if array.ndim and len(array) == n}
-    return [
-        {
-            ("track_id" if row.ndim == 0 else name): int(row) if row.ndim == 0 else row
-            for name, row in ((name, array[i]) for name, array in split.items())
-        }
-        for i in range(n)
-    ]
+    bodies: list[dict[Key, Any]] = [{} for _ in range(n)]
+    for name, array in split.items():
+        for body, row in zip(bodies, array, strict=True):
+            body[name if array.ndim > 1 else "track_id"] = row if array.ndim > 1 else int(row)
+    return bodies
 
 
 def _layout_of(content: Content, node: Mapping[Key, Any]) -> table.Layout | None:
@@ -161,7 +159,7 @@ def _stacked(content: Content, layout: table.Layout, seen: list[tuple[int, Mappi
     """One person's arrays, one row per frame; what isn't in every frame is left out."""
     track: dict[Key, Any] = {"frame_ids": np.array([number for number, _ in seen])}
     track |= {key: seen[0][1][key] for key in (*table.GENDERS, *table.MODELS) if seen[0][1].get(key) is not None}
-    for name in (*layout.pose, *layout.transl, *layout.betas):
+    for name in layout.arrays:
         rows = [body.get(name) for _, body in seen]
         if any(row is None for row in rows):
             continue
@@ -249,15 +247,11 @@ def _who_is_who(frames: Iterable[Sequence[tuple[str, NDArray[np.float64]]]]) -> 
 
 
 def _mapping(value: Any) -> Mapping[Key, Any] | None:
-    return None if isinstance(value, (list, tuple)) else entries(value)
+    return None if isinstance(held_by(value), (list, tuple)) else entries(value)
 
 
 def _items(value: Any) -> Sequence[Any]:
-    if isinstance(value, Record) and value.kind == "array":  # NumPy's way to save objects
-        state = value.state
-        held = state[4] if isinstance(state, tuple) and len(state) == 5 and isinstance(state[4], list) else ()
-        return _items(held[0]) if len(held) == 1 else held
-    inside = _mapping(value)
-    if inside is not None:
-        return list(inside.values())
-    return value if isinstance(value, (list, tuple)) else ()
+    value = held_by(value)
+    if isinstance(value, (list, tuple)):
+        return value
+    return list((entries(value) or {}).values())

@@ -101,17 +101,12 @@ def to_smpl(
         if there.any():
             turned[there] = (Rotation.from_matrix(turn) * Rotation.from_rotvec(roots[there])).as_rotvec()
         roots, transl = turned, transl @ turn.T + (turn - np.eye(3)) @ pelvis
-    if not lies:
-        _tell_lying(roots, notes)
-    return roots, transl
-
-
-def _tell_lying(roots: Array, notes: list[str]) -> None:
     sound = roots[_are_sound(roots)]
-    if not len(sound):
-        return
+    if lies or not len(sound):
+        return roots, transl
     share, lean = upright_share(sound), float(up_of_root(sound)[:, 1].mean())
     if share < 0.5:
         notes.append(f"the person is upright in {100 * share:.0f} % of the frames only")
     elif lean < _LEANS:
         notes.append(f"the person leans by {np.degrees(np.arccos(lean)):.0f}° on average: perhaps the camera is tilted")
+    return roots, transl

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from refu_core.frames import N_BETAS
 from refu_core.recordings import _layouts as table
@@ -16,14 +15,6 @@ from refu_core.recordings._containers import Content
 GENDERS = {"m": "male", "male": "male", "f": "female", "female": "female", "n": "neutral", "neutral": "neutral"}
 _STEADY = 1e-3  # betas that differ by less between frames are one shape
 _SAY_IT = "say it, as in --fps 30 (in Python: fps=30)"
-
-
-def turned(place: NDArray[np.float64], roots: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where roots (T, 3) [rad] take a place (3,) by turning it about the mesh's origin [m], shape (T, 3)."""
-    found = np.full(roots.shape, np.nan)
-    sound = np.isfinite(roots).all(axis=1)
-    found[sound] = Rotation.from_rotvec(roots[sound]).apply(place)
-    return found
 
 
 def transl_of(array: NDArray[Any] | None, layout: table.Layout, n: int, notes: list[str]) -> NDArray[np.float64]:
@@ -74,12 +65,8 @@ def fps_of(content: Content, value: Any) -> float:
     """Frames a second. Raises `ValueError` if there is no such number."""
     if value is None:
         raise ValueError(f"no frame rate in the file: {_SAY_IT}")
-    if type(value) in (int, float):
-        return float(value)
-    array = np.asarray(value) if isinstance(value, str) else content.array(value)
-    if array.size == 1 and array.dtype.kind in "iuf":
-        return float(array.reshape(-1)[0])
-    if array.size == 1 and array.dtype.kind in "US":
+    array = np.asarray(value) if isinstance(value, (int, float, str)) else content.array(value)
+    if array.size == 1 and array.dtype.kind in "iufUS":
         with contextlib.suppress(ValueError):
             return float(word_of(content, array))
     got = f"{table.RATES[0]} must be one number, got {array.dtype} {array.shape}"

@@ -73,8 +73,7 @@ def _by_colour(pairs: NDArray[np.int32]) -> NDArray[np.int32]:
         taken[i] = taken.get(i, 0) | bit
         taken[j] = taken.get(j, 0) | bit
         colour[k] = bit.bit_length()
-    found: NDArray[np.int32] = pairs[np.argsort(colour, kind="stable")]
-    return found
+    return pairs[np.argsort(colour, kind="stable")]
 
 
 _Contacts = tuple[I32, F32, F32, F32]
@@ -138,14 +137,7 @@ class _Skin:
         """Which of the points (N, 3) must be queried again: those that have moved too far since their last query."""
         near, slide = np.float32(_NEAR), np.float32(_SLIDE)
         allowed = np.where(self.distance > near + slide, self.distance - near, slide)
-        return np.flatnonzero(_squared_way(points, self.asked_at) > allowed * allowed).astype(np.int32)
-
-
-def _squared_way(points: F32, before: F32) -> F32:
-    """The square of the distance that each point has moved [m²], shape (N,)."""
-    way = points - before
-    squared: F32 = (way * way).sum(1)
-    return squared
+        return np.flatnonzero(np.square(points - self.asked_at).sum(1) > allowed * allowed).astype(np.int32)
 
 
 class SimulatedCloth:
@@ -257,7 +249,9 @@ class SimulatedCloth:
         none = np.zeros((0, 3), np.float32)
         for first in range(0, s.substeps, refresh):
             body = body_from if motion is None else body_from + np.float32(first) * motion
-            contacts = self._contacts(body, motion, everything=moving and first == 0)
+            is_all = moving and first == 0
+            stale = np.arange(len(self.positions), dtype=np.int32) if is_all else self._skin.stale(self.positions)
+            contacts = self._touch(self._skin, self.positions, stale, body, motion)
             edges = self._edge_contacts(body, motion) if careful else (np.zeros((0, 2), np.int32), none, none, none)
             pairs = self._pairs()
             for _ in range(min(refresh, s.substeps - first)):
@@ -278,20 +272,11 @@ class SimulatedCloth:
         from refu_core.simulation._solver import find_candidates, near_pairs
 
         faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
-        if float(np.sqrt(_squared_way(self.positions, self._searched_at).max())) > _PAIR_SLACK / 2:
-            self._candidates = find_candidates(
-                self.positions,
-                faces,
-                self._told_apart,
-                np.float32(2.2 * self._edge_length),
-                reach + np.float32(_PAIR_SLACK),
-            )
+        if float(np.sqrt(np.square(self.positions - self._searched_at).sum(1).max())) > _PAIR_SLACK / 2:
+            rest_apart, cell = np.float32(2.2 * self._edge_length), reach + np.float32(_PAIR_SLACK)
+            self._candidates = find_candidates(self.positions, faces, self._told_apart, rest_apart, cell)
             self._searched_at[:] = self.positions
         return near_pairs(self.positions, faces, *self._candidates, np.float32(_PAIR_REACH))
-
-    def _contacts(self, body: F32, motion: F32 | None, *, everything: bool) -> _Contacts:
-        stale = self._skin.stale(self.positions) if not everything else np.arange(len(self.positions), dtype=np.int32)
-        return self._touch(self._skin, self.positions, stale, body, motion)
 
     def _edge_contacts(self, body: F32, motion: F32 | None) -> _Contacts:
         edges, skin = self.topology.mesh.edges, self._middles

@@ -11,21 +11,10 @@ from numpy.typing import NDArray
 
 from refu_core.errors import SimulationError
 from refu_core.frames import MAX_ANGLE, MAX_COEFFICIENT
+from refu_core.simulation import _store as store
 from refu_core.simulation._joined import slices_of
 from refu_core.simulation._plan import TEST
 from refu_core.simulation._poses import POSTURES
-from refu_core.simulation._store import (
-    CAUSES,
-    DONE,
-    FORMAT,
-    FPS,
-    QUANTUM,
-    SEQUENCES,
-    Rows,
-    dequantise,
-    read_card,
-    read_unseen,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +86,7 @@ class GarmentSequence:
 
         Only the asked frames are read from disk.
         """
-        return dequantise(np.asarray(self._units[frames]))
+        return store.dequantise(np.asarray(self._units[frames]))
 
 
 class _Finished:
@@ -105,23 +94,23 @@ class _Finished:
 
     def __init__(self, path: str | Path, kind: str, *, first_clip: int) -> None:
         self._path = Path(path)
-        self.card: dict[str, Any] = read_card(self._path, kind)
+        self.card: dict[str, Any] = store.read_card(self._path, kind)
         """What the set is: plan, settings, versions, and counts and yield once it is summarised."""
-        stored = Rows(self._path, kind)
-        self._columns, self._rows = stored.arrays, stored.finished(DONE)
+        stored = store.Rows(self._path, kind)
+        self._columns, self._rows = stored.arrays, stored.finished(store.DONE)
         self.parts = self._parts(self._columns["vertices"].shape[-2])
         """The slice of a row's vertices of each garment: several where garments were simulated together."""
         self._clips = self._clip_names()
-        self._check("split", 0, 2)
+        self._check("split", 0, 1)
         self.test: NDArray[np.bool_] = self.column("split") == TEST
         self.train: NDArray[np.bool_] = ~self.test
         """Which rows are for training, shape (M,); the others, `test`, are kept for the test."""
-        self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])))
-        if self.card.get("quantum_m") != QUANTUM:
-            msg = f"{path}: wanted positions in units of {QUANTUM} m, got {str(self.card.get('quantum_m'))[:80]}"
+        self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])) - 1)
+        if self.card.get("quantum_m") != store.QUANTUM:
+            msg = f"{path}: wanted positions in units of {store.QUANTUM} m, got {str(self.card.get('quantum_m'))[:80]}"
             raise SimulationError(msg)
         for name, largest in (("pose", MAX_ANGLE), ("betas", MAX_COEFFICIENT), ("style", MAX_COEFFICIENT)):
-            self._check_numbers(name, largest)
+            self._check(name, -largest, largest)
 
     def _parts(self, n_vertices: int) -> dict[str, slice]:
         """Raises `SimulationError` for a card whose garments don't have that many vertices."""
@@ -143,24 +132,14 @@ class _Finished:
             raise SimulationError(msg)
         return {split: [str(name) for name in value or ()] for split, value in names.items()}
 
-    def _check(self, name: str, low: int, high: Any) -> None:
-        """Raises `SimulationError` where a column of whole numbers is below `low`, or not below `high`."""
+    def _check(self, name: str, low: float, high: Any) -> None:
+        """Raises `SimulationError` where a column has a number that isn't from `low` to `high`."""
         values = self.column(name)
         high = np.broadcast_to(high, values.shape)
-        bad = np.flatnonzero((values < low) | (values >= high))
+        bad = np.flatnonzero(~((values >= low) & (values <= high)))  # also NaN
         if bad.size:
-            msg = f"{self._path}: damaged: {name} is {values.flat[bad[0]]}, "
-            msg += f"wanted {low} to {high.flat[bad[0]] - 1}; simulate it again"
-            raise SimulationError(msg)
-
-    def _check_numbers(self, name: str, largest: float) -> None:
-        """Raises `SimulationError` where a column has numbers that no `SmplFrame` accepts."""
-        values = self.column(name).reshape(len(self), -1)
-        bad = np.flatnonzero(~(np.abs(values) <= largest).all(1))  # False for NaN
-        if bad.size:
-            msg = f"{self._path}: damaged: {name} of sample {bad[0]} isn't finite and at most {largest:g}; "
-            msg += "simulate it again"
-            raise SimulationError(msg)
+            got = f"{name} is {values.flat[bad[0]]}, wanted {low:g} to {high.flat[bad[0]]:g}"
+            raise SimulationError(f"{self._path}: damaged: {got}; simulate it again")
 
     def __len__(self) -> int:
         """Finished rows."""
@@ -194,14 +173,14 @@ class GarmentDataset(_Finished):
 
     def __init__(self, path: str | Path) -> None:
         """Opens the set in the directory `path`. Raises `SimulationError` when there is none, or a damaged one."""
-        super().__init__(path, FORMAT, first_clip=-1)
+        super().__init__(path, store.FORMAT, first_clip=-1)
         plan = self.card.get("plan")
         count = plan.get("count") if isinstance(plan, dict) else None
         if not isinstance(count, int) or not 0 <= count < 2**31:
             msg = f"{path}: wanted a card with the number of samples in plan.count, got {str(count)[:80]}"
             raise SimulationError(msg)
-        self._check("slot", 0, count)
-        self._unseen = read_unseen(self._path, count)
+        self._check("slot", 0, count - 1)
+        self._unseen = store.read_unseen(self._path, count)
 
     def sample(self, index: int) -> GarmentSample:
         """The sample of this index, -M to M - 1; its arrays are copies.
@@ -212,7 +191,7 @@ class GarmentDataset(_Finished):
         clip, frame = int(row["clip"]), int(row["frame"])
         copied: dict[str, Any] = {name: np.array(row[name]) for name in ("pose", "betas", "style")}
         return GarmentSample(
-            vertices=dequantise(row["vertices"]),
+            vertices=store.dequantise(row["vertices"]),
             **copied,
             slot=int(row["slot"]),
             pair=int(row["pair"]),
@@ -229,8 +208,8 @@ class GarmentSequences(_Finished):
 
     def __init__(self, path: str | Path) -> None:
         """Opens the set in the directory `path`. Raises `SimulationError` when there is none, or a damaged one."""
-        super().__init__(path, SEQUENCES, first_clip=0)
-        self._check("cause", 0, len(CAUSES) + 1)
+        super().__init__(path, store.SEQUENCES, first_clip=0)
+        self._check("cause", 0, len(store.CAUSES))
 
     def sequence(self, index: int) -> GarmentSequence:
         """The sequence of this index, -S to S - 1. Raises `SimulationError` when there is no such sequence."""
@@ -238,9 +217,9 @@ class GarmentSequences(_Finished):
         copied: dict[str, Any] = {name: np.array(row[name]) for name in ("pose", "transl", "betas", "style")}
         return GarmentSequence(
             kept=np.asarray(row["cause"] == 0),
-            cause=[None if cause == 0 else CAUSES[cause - 1] for cause in row["cause"]],
+            cause=[None if cause == 0 else store.CAUSES[cause - 1] for cause in row["cause"]],
             **copied,
-            fps=float(FPS),
+            fps=float(store.FPS),
             number=int(row["slot"]),
             shape=int(row["shape"]),
             split=split,
@@ -253,5 +232,5 @@ class GarmentSequences(_Finished):
 
 def open_dataset(path: str | Path) -> GarmentDataset | GarmentSequences:
     """Opens the set in the directory `path`: garments at rest, or sequences. Raises `SimulationError` as they do."""
-    is_sequences = read_card(Path(path), FORMAT, SEQUENCES)["format"] == SEQUENCES
+    is_sequences = store.read_card(Path(path), store.FORMAT, store.SEQUENCES)["format"] == store.SEQUENCES
     return GarmentSequences(path) if is_sequences else GarmentDataset(path)

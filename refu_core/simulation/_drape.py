@@ -21,7 +21,7 @@ from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
 from refu_core.metrics import SheetChecker
-from refu_core.realtime._turn import RootTurn
+from refu_core.realtime import RootTurn
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothSettings, ClothTopology, SimulatedCloth
 from refu_core.simulation._joined import JoinedGarments
@@ -194,8 +194,7 @@ class Draper:
         self.topology = ClothTopology.of(garment.mesh)
         # The BVH decides which of two equally close faces is found, and so a result's last bit. It is built anew for
         # each drape, on a mesh that depends on the drape alone, and never in between.
-        sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
-        self._sdf = sdf
+        self._sdf = sdf = ExactSdf(body.faces, rebuild_distance=math.inf)
         self._collider = Collider(body, settings=ColliderSettings(gap=self.settings.gap))
         counts = [garment.n_vertices for garment in self.outfit.garments]
         piece = np.repeat(np.arange(len(counts)), counts)
@@ -219,8 +218,7 @@ class Draper:
 
     def rest(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> F32:
         """The garment cut for this shape and style [m], shape (N, 3): its edges are the cloth's rest lengths."""
-        rest: F32 = self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
-        return rest
+        return self.garment.rest(_alone(betas), self.garment.own(_alone(style)))[0].numpy()
 
     def bodies(self, poses: NDArray[np.floating], betas: NDArray[np.floating]) -> F32:
         """What cloth lies on: the colliders of poses (P, 24, 3) [rad] and a shape (10,) [m], shape (P, V, 3)."""
@@ -290,7 +288,6 @@ class Draper:
         bodies = self.bodies(poses, betas)
         self.begin(start, betas, style, bodies[-1])
         down = np.array([0, -GRAVITY, 0])
-        gravity = np.zeros(3, np.float32)
         for after, tilt in zip(bodies, tilts, strict=True):
             gravity = Rotation.from_rotvec(tilt[0]).inv().apply(down).astype(np.float32)
             self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
@@ -303,9 +300,6 @@ class Draper:
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
         level = self._untangle(self.cloth.positions, body)
-        return SettledDrape(self._with_root(level, root, betas), speed, self.cloth.stretch(level))
-
-    def _with_root(self, points: F32, root: Rotation, betas: NDArray[np.floating]) -> F32:
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
-        turned: F32 = np.ascontiguousarray(root.apply(points.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
-        return turned
+        turned = np.ascontiguousarray(root.apply(level.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
+        return SettledDrape(turned, speed, self.cloth.stretch(level))

@@ -59,21 +59,16 @@ class JoinedGarments:
         out: F32 = positions.copy()
         for garment in self.garments[1:]:
             own = self.parts[garment.name]
-            height, outwards = _over_skin(sdf, body, out[: own.stop])
+            found = sdf.closest(torch.from_numpy(out[: own.stop]))
+            height = (found.distance * found.sign).numpy()
+            normals = face_normals(body, sdf.faces.numpy()[found.face[own].numpy()])
+            outwards = normals / np.linalg.norm(normals, axis=1, keepdims=True)
             below, mine = out[: own.start], out[own]
             beside = cKDTree(below).query_ball_point(mine, _BESIDE)
             highest = np.array([height[near].max() + _OVER if near else -np.inf for near in beside], np.float32)
             lift = np.maximum(highest - height[own], 0)
-            out[own] = mine + lift[:, None] * outwards[own]
+            out[own] = mine + lift[:, None] * outwards
         return out
-
-
-def _over_skin(sdf: ExactSdf, body: F32, points: F32) -> tuple[F32, F32]:
-    """Signed distances of points (P, 3) to the skin [m], (P,), and the normals of the skin below them, (P, 3)."""
-    found = sdf.closest(torch.from_numpy(np.ascontiguousarray(points)))
-    height = (found.distance * found.sign).numpy()
-    normals = face_normals(body, sdf.faces.numpy()[found.face.numpy()])
-    return height, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def _joined(garments: tuple[GarmentTemplate, ...], parts: Mapping[str, slice]) -> GarmentTemplate:

@@ -37,8 +37,7 @@ def names_of(garment: str | Sequence[str]) -> str:
 def truncated_normal(u: NDArray[np.float64], spread: float) -> NDArray[np.float32]:
     """Maps uniform `u` in [0, 1) to normal numbers of this standard deviation, cut off at ±2."""
     edge = ndtr(2 / spread)
-    value: NDArray[np.float32] = np.clip(spread * ndtri((1 - edge) + u * (2 * edge - 1)), -2, 2).astype(np.float32)
-    return value
+    return np.clip(spread * ndtri((1 - edge) + u * (2 * edge - 1)), -2, 2).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,9 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     path = Path(path)
     files = [path]
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES and not _is_shape(file))
+        files = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES)
+        # AMASS keeps shapes without motion among its motions.
+        files = [file for file in files if file.name != "shape.npz" and not file.stem.endswith("_stagei")]
     if not files or not files[0].exists():
         msg = f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder of them or a file"
         raise SimulationError(msg)
@@ -93,11 +95,6 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
 def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
     """The given clips, or those loaded from a file or folder. Raises as `load_clips`."""
     return load_clips(motions) if isinstance(motions, (str, Path)) else list(motions)
-
-
-def _is_shape(path: Path) -> bool:
-    """Whether a file holds a shape without motion; AMASS keeps such files among its motions."""
-    return path.name == "shape.npz" or path.stem.endswith("_stagei")
 
 
 def split_clips(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
@@ -124,10 +121,9 @@ def without_heading(pose: NDArray[np.floating]) -> NDArray[np.float32]:
     return out
 
 
-def mirrored(pose: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The pose (24, 3) of the mirror image, left and right exchanged [rad]."""
-    image: NDArray[np.float32] = np.asarray(pose, np.float32)[MIRRORED_JOINTS,] * np.array([1, -1, -1], np.float32)
-    return image
+def mirrored(poses: NDArray[np.floating]) -> NDArray[np.float32]:
+    """The poses (…, 24, 3) of the mirror image, left and right exchanged [rad]."""
+    return poses[..., MIRRORED_JOINTS, :] * np.array([1, -1, -1], np.float32)
 
 
 def random_pose(rng: np.random.Generator) -> NDArray[np.float32]:
@@ -208,8 +204,7 @@ _STIFF = tuple(JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right")
 
 def posture(name: str) -> NDArray[np.float32]:
     """One of `POSTURES`, rotation vectors [rad], shape (24, 3). Raises `KeyError` for another name."""
-    pose: NDArray[np.float32] = np.radians(posed(POSTURES[name])).astype(np.float32)
-    return pose
+    return np.radians(posed(POSTURES[name])).astype(np.float32)
 
 
 def drawn_posture(rng: np.random.Generator, names: Sequence[str]) -> tuple[NDArray[np.float32], int]:

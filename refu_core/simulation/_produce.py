@@ -19,23 +19,9 @@ from refu_core._files import replacing
 from refu_core._versions import versions
 from refu_core.errors import SimulationError
 from refu_core.frames import N_JOINTS
+from refu_core.simulation import _store as store
 from refu_core.simulation._plan import TEST, TRAIN, SamplePlan
 from refu_core.simulation._poses import POSTURES, Clip, as_clips, split_clips
-from refu_core.simulation._store import (
-    CAUSES,
-    DONE,
-    FORMAT,
-    FPS,
-    GIVEN_UP,
-    QUANTUM,
-    SEQUENCES,
-    TO_DO,
-    Rows,
-    has_rows,
-    locked,
-    read_card,
-    write_card,
-)
 from refu_core.simulation._worker import SimulationSettings, Simulator, SlotSimulator
 
 
@@ -48,20 +34,20 @@ def summarise(output: str | Path) -> dict[str, Any]:
     Raises `SimulationError` when `output` holds no set.
     """
     output = Path(output)
-    card = read_card(output, FORMAT, SEQUENCES)
-    stored = Rows(output, card["format"])
-    rows = stored.finished(DONE, GIVEN_UP)
+    card = store.read_card(output, store.FORMAT, store.SEQUENCES)
+    stored = store.Rows(output, card["format"])
+    rows = stored.finished(store.DONE, store.GIVEN_UP)
     column = {name: values[rows] for name, values in stored.arrays.items() if name != "vertices"}
-    done = column["state"] == DONE
+    done = column["state"] == store.DONE
     dropped = column["dropped"].sum(0, dtype=np.int64)
     train, test = (int((done & (column["split"] == split)).sum()) for split in (TRAIN, TEST))
     counts = {"train": train, "test": test, "given_up": int((~done).sum()), "to_do": card["plan"]["count"] - len(done)}
     figures: dict[str, float] = {}
     seconds = float(column["seconds"].sum())
-    if card["format"] == SEQUENCES:
+    if card["format"] == store.SEQUENCES:
         good = column["cause"] == 0
         kept = good & done[:, None]
-        simulated = int(done.sum()) * round(card["plan"]["seconds"] * FPS)
+        simulated = int(done.sum()) * round(card["plan"]["seconds"] * store.FPS)
         counts |= {"frames": simulated, "frames_kept": int(kept.sum())}
         if done.any():
             shares = good[done].mean(1)
@@ -79,17 +65,17 @@ def summarise(output: str | Path) -> dict[str, Any]:
         figures["stretch_p999_median"] = float(np.median(column["stretch"][kept]))
         figures["stretch_p999_largest"] = float(column["stretch"][kept].max())
         figures["speed_m_s_median"] = float(np.median(column["speed"][kept]))
-    share, causes = float(kept.sum() / max(simulated, 1)), dict(zip(CAUSES, dropped.tolist(), strict=True))
+    share, causes = float(kept.sum() / max(simulated, 1)), dict(zip(store.CAUSES, dropped.tolist(), strict=True))
     card |= {"counts": counts, "yield": {"simulated": simulated, "kept_share": share, "dropped": causes}}
     card |= {"figures": figures} if figures else {}
-    write_card(output, card)
+    store.write_card(output, card)
     return card
 
 
 def _unseen(column: dict[str, NDArray[Any]], count: int) -> NDArray[np.float32]:
     """By slot, how far each test sample is from the nearest training sample (count,); NaN for the others."""
     unseen = np.full(count, np.nan, np.float32)
-    kept = column["state"] == DONE
+    kept = column["state"] == store.DONE
     train, test = (kept & (column["split"] == split) for split in (TRAIN, TEST))
     parameters = np.concatenate([column["pose"].reshape(len(kept), 3 * N_JOINTS), column["betas"], column["style"]], 1)
     if train.any():
@@ -110,11 +96,6 @@ class Progress:
     """What failed in the finished slots, by cause: attempts at a sample, frames of a sequence."""
 
 
-def _block_of(simulator: type[Simulator], *given: Any) -> Callable[[list[int]], list[dict[str, Any]]]:
-    """Makes a process's function from slots to their rows; all that it is given is sent to that process."""
-    return simulator(*given).block
-
-
 def produce(
     kind: type[Simulator],
     *given: Any,
@@ -133,22 +114,22 @@ def produce(
     blocks = [list(block) for block in simulator.plan.blocks()]
     slots = np.array([slot for block in blocks for slot in block], np.int32)
     _open_set(output, _card_of(simulator) | card)
-    if not has_rows(output):
-        Rows.create(output, simulator.kind, slots, simulator.shape)
-    with locked(output):
-        rows = Rows(output, simulator.kind, mode="r+")
+    if not store.has_rows(output):
+        store.Rows.create(output, simulator.kind, slots, simulator.shape)
+    with store.locked(output):
+        rows = store.Rows(output, simulator.kind, mode="r+")
         if not np.array_equal(rows.arrays["slot"], slots):
             raise SimulationError(f"{output}: holds other slots than this plan's; give another output directory")
         state, row_of = rows.arrays["state"], {int(slot): row for row, slot in enumerate(slots)}
-        left = [[slot for slot in block if state[row_of[slot]] == TO_DO] for block in blocks]
-        make_block: Callable[[], Callable[[list[int]], list[dict[str, Any]]]] = partial(_block_of, kind, *given)
+        left = [[slot for slot in block if state[row_of[slot]] == store.TO_DO] for block in blocks]
+        make: Callable[[], Simulator] = partial(kind, *given)
         if engine is None or isinstance(engine, InProcess):  # one slot at a time is on disk soonest
-            engine, make_block = InProcess(), lambda: simulator.block
+            engine, make = InProcess(), lambda: simulator
             left = [[slot] for block in left for slot in block]
         left = [block for block in left if block]
         # A whole block goes to one process, because its slots share a canonical drape.
         done, total, lost = 0, sum(map(len, left)), 0
-        for index, made in engine.run(make_block, left):
+        for index, made in engine.run(make, left):
             if isinstance(made, Lost):
                 lost += len(left[index])
                 continue
@@ -156,8 +137,8 @@ def produce(
                 rows.write(row_of[slot], values)
             done += len(made)
             if progress is not None:
-                dropped = rows.arrays["dropped"][state != TO_DO].sum(0, dtype=np.int64).tolist()
-                progress(Progress(len(slots) - total + done, len(slots), dict(zip(CAUSES, dropped, strict=True))))
+                dropped = rows.arrays["dropped"][state != store.TO_DO].sum(0, dtype=np.int64).tolist()
+                progress(Progress(len(slots) - total + done, len(slots), dict(zip(store.CAUSES, dropped, strict=True))))
         if lost:
             msg = f"{lost} of {total} slots were lost with their processes (out of memory?): "
             msg += "finished samples are kept, run the same command to go on"
@@ -183,7 +164,7 @@ def _card_of(simulator: Simulator) -> dict[str, Any]:
         "body_fingerprint": body.fingerprint,
         "garment_fingerprint": digest.hexdigest()[:16],
         "motions_fingerprint": motions.hexdigest()[:16],
-        "quantum_m": QUANTUM,
+        "quantum_m": store.QUANTUM,
         "plan": asdict(simulator.plan) | {"garment": garment.name},  # whatever its file was called
         "settings": asdict(simulator.settings),
         "clips": {"train": [clip.name for clip in clips[0]], "test": [clip.name for clip in clips[1]]},
@@ -203,11 +184,11 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
             if any(output.iterdir()):
                 msg = f"{output}: is neither empty nor a simulated data set; give another output directory"
                 raise SimulationError(msg)
-            write_card(output, card)
+            store.write_card(output, card)
             return
     except OSError as error:
         raise SimulationError(f"{output}: can't be written: {error}") from error
-    there, wanted = read_card(output, card["format"]), json.loads(json.dumps(card))
+    there, wanted = store.read_card(output, card["format"]), json.loads(json.dumps(card))
     differing = [key for key in _MUST_AGREE if there.get(key) != wanted[key]]
     if differing:
         msg = f"{output}: holds another set ({', '.join(differing)} differ); give another output directory"

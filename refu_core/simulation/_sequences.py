@@ -81,10 +81,9 @@ def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) 
     first = int(rng.integers(lengths[which] - n + 1))
     mirror = bool(rng.random() < 0.5)
     clip = clips[which].resampled(rate)
-    poses, transl = clip.poses[first : first + n].copy(), clip.transl[first : first + n].copy()
+    poses, transl = clip.poses[first : first + n], clip.transl[first : first + n]
     if mirror:
-        poses = np.stack([mirrored(pose) for pose in poses])
-        transl[:, 0] *= -1
+        poses, transl = mirrored(poses), transl * (-1, 1, 1)
     root = Rotation.from_rotvec(poses[:, 0].astype(np.float64))
     heading = Rotation.from_rotvec(without_heading(poses[0])[0].astype(np.float64)) * root[0].inv()
     poses[:, 0] = (heading * root).as_rotvec()
@@ -133,8 +132,7 @@ class SequencePlan:
 
     def blocks(self) -> list[list[int]]:
         """Each sequence by itself, in an order that mixes shapes and motions."""
-        order = np.random.default_rng(self._key(0)).permutation(self.count)
-        return [[int(slot)] for slot in order]
+        return [[int(slot)] for slot in np.random.default_rng(self._key(0)).permutation(self.count)]
 
     def _key(self, *numbers: int) -> list[int]:
         return [self.seed, zlib.crc32(f"{names_of(self.garment)} sequences".encode()), *numbers]
@@ -146,8 +144,7 @@ class SequencePlan:
 
     def motion(self, slot: int, clips: list[Clip]) -> DrawnMotion:
         """The motion that a sequence shows. Raises `SimulationError` when no clip is long enough."""
-        rng = np.random.default_rng(self._key(2, slot))
-        return draw_motion(clips, self.n_frames, rng)
+        return draw_motion(clips, self.n_frames, np.random.default_rng(self._key(2, slot)))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,32 @@ _TINY = np.float32(1e-12)
 
 _Floats = NDArray[np.float32]
 _Ints = NDArray[np.int32]
+_Vector = tuple[np.float32, np.float32, np.float32]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _between(x: _Floats, i: np.int32, j: np.int32) -> _Vector:
+    """The vector to row i from row j."""
+    return x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _dot(u: _Vector, v: _Vector) -> np.float32:
+    product: np.float32 = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+    return product
+
+
+@numba.njit(cache=True, fastmath=True)
+def _cross(u: _Vector, v: _Vector) -> _Vector:
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@numba.njit(cache=True, fastmath=True)
+def _shift(x: _Floats, i: np.int32, step: np.float32, way: _Vector) -> None:
+    """Moves row i by a step along a way."""
+    x[i, 0] += step * way[0]
+    x[i, 1] += step * way[1]
+    x[i, 2] += step * way[2]
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -60,15 +86,9 @@ def substep(
             previous[i, k] = x[i, k]
             v[i, k] = v[i, k] * damping + h * gravity[k]
             x[i, k] += h * v[i, k]
-    for c in range(contact_vertex.shape[0]):
-        for k in range(3):
-            contact_point[c, k] += contact_motion[c, k]
-    for c in range(anchor_vertex.shape[0]):
-        for k in range(3):
-            anchor_point[c, k] += anchor_motion[c, k]
-    for c in range(edge_ends.shape[0]):
-        for k in range(3):
-            edge_point[c, k] += edge_motion[c, k]
+    contact_point += contact_motion
+    anchor_point += anchor_motion
+    edge_point += edge_motion
 
     for _ in range(iterations):
         for c in range(anchor_vertex.shape[0]):
@@ -78,50 +98,33 @@ def substep(
         for e in range(ends.shape[0]):
             i = ends[e, 0]
             j = ends[e, 1]
-            dx = x[i, 0] - x[j, 0]
-            dy = x[i, 1] - x[j, 1]
-            dz = x[i, 2] - x[j, 2]
-            length = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
+            way = _between(x, i, j)
+            length = np.sqrt(_dot(way, way)) + _TINY
             wi = inverse_mass[i]
             wj = inverse_mass[j]
             s = (min(max(length, shortest[e]), longest[e]) - length) / ((wi + wj + softness[e]) * length)
-            a = s * wi
-            b = s * wj
-            x[i, 0] += a * dx
-            x[i, 1] += a * dy
-            x[i, 2] += a * dz
-            x[j, 0] -= b * dx
-            x[j, 1] -= b * dy
-            x[j, 2] -= b * dz
+            _shift(x, i, s * wi, way)
+            _shift(x, j, -s * wj, way)
         _separate_pairs(x, inverse_mass, pair_vertex, pair_face, pair_side, thickness)
         for c in range(contact_vertex.shape[0]):
             i = contact_vertex[c]
-            nx = contact_normal[c, 0]
-            ny = contact_normal[c, 1]
-            nz = contact_normal[c, 2]
+            normal = (contact_normal[c, 0], contact_normal[c, 1], contact_normal[c, 2])
             depth = (
                 margin
-                - (x[i, 0] - contact_point[c, 0]) * nx
-                - (x[i, 1] - contact_point[c, 1]) * ny
-                - (x[i, 2] - contact_point[c, 2]) * nz
+                - (x[i, 0] - contact_point[c, 0]) * normal[0]
+                - (x[i, 1] - contact_point[c, 1]) * normal[1]
+                - (x[i, 2] - contact_point[c, 2]) * normal[2]
             )
             if depth > 0:
-                x[i, 0] += depth * nx
-                x[i, 1] += depth * ny
-                x[i, 2] += depth * nz
+                _shift(x, i, depth, normal)
                 # Coulomb friction on the sliding over the moving skin since the start of the substep.
                 sx = x[i, 0] - previous[i, 0] - contact_motion[c, 0]
                 sy = x[i, 1] - previous[i, 1] - contact_motion[c, 1]
                 sz = x[i, 2] - previous[i, 2] - contact_motion[c, 2]
-                along = sx * nx + sy * ny + sz * nz
-                sx -= along * nx
-                sy -= along * ny
-                sz -= along * nz
-                slide = np.sqrt(sx * sx + sy * sy + sz * sz) + _TINY
-                s = min(one, friction * depth / slide)
-                x[i, 0] -= s * sx
-                x[i, 1] -= s * sy
-                x[i, 2] -= s * sz
+                along = _dot((sx, sy, sz), normal)
+                slide = (sx - along * normal[0], sy - along * normal[1], sz - along * normal[2])
+                s = min(one, friction * depth / (np.sqrt(_dot(slide, slide)) + _TINY))
+                _shift(x, i, -s, slide)
         for c in range(edge_ends.shape[0]):
             i = edge_ends[c, 0]
             j = edge_ends[c, 1]
@@ -162,26 +165,16 @@ def _separate_pairs(
         a = pair_face[c, 0]
         b = pair_face[c, 1]
         d = pair_face[c, 2]
-        ux = x[b, 0] - x[a, 0]
-        uy = x[b, 1] - x[a, 1]
-        uz = x[b, 2] - x[a, 2]
-        vx = x[d, 0] - x[a, 0]
-        vy = x[d, 1] - x[a, 1]
-        vz = x[d, 2] - x[a, 2]
-        nx = uy * vz - uz * vy
-        ny = uz * vx - ux * vz
-        nz = ux * vy - uy * vx
-        area2 = nx * nx + ny * ny + nz * nz + _TINY * _TINY
+        u, v, r = _between(x, b, a), _between(x, d, a), _between(x, i, a)
+        normal = _cross(u, v)
+        area2 = _dot(normal, normal) + _TINY * _TINY
         area = np.sqrt(area2)
-        rx = x[i, 0] - x[a, 0]
-        ry = x[i, 1] - x[a, 1]
-        rz = x[i, 2] - x[a, 2]
         side = pair_side[c]
-        distance = (rx * nx + ry * ny + rz * nz) / area * side
+        distance = _dot(r, normal) / area * side
         if distance >= thickness or distance < -thickness - thickness:
             continue
-        wb = ((ry * vz - rz * vy) * nx + (rz * vx - rx * vz) * ny + (rx * vy - ry * vx) * nz) / area2
-        wd = ((uy * rz - uz * ry) * nx + (uz * rx - ux * rz) * ny + (ux * ry - uy * rx) * nz) / area2
+        wb = _dot(_cross(r, v), normal) / area2
+        wd = _dot(_cross(u, r), normal) / area2
         wa = one - wb - wd
         if wa < -slack or wb < -slack or wd < -slack:
             continue
@@ -189,22 +182,10 @@ def _separate_pairs(
             inverse_mass[i] + inverse_mass[a] * wa * wa + inverse_mass[b] * wb * wb + inverse_mass[d] * wd * wd
         ) * area
         s = np.float32(0.5) * (thickness - distance) / mass * side
-        si = s * inverse_mass[i]
-        sa = s * inverse_mass[a] * wa
-        sb = s * inverse_mass[b] * wb
-        sd = s * inverse_mass[d] * wd
-        x[i, 0] += si * nx
-        x[i, 1] += si * ny
-        x[i, 2] += si * nz
-        x[a, 0] -= sa * nx
-        x[a, 1] -= sa * ny
-        x[a, 2] -= sa * nz
-        x[b, 0] -= sb * nx
-        x[b, 1] -= sb * ny
-        x[b, 2] -= sb * nz
-        x[d, 0] -= sd * nx
-        x[d, 1] -= sd * ny
-        x[d, 2] -= sd * nz
+        _shift(x, i, s * inverse_mass[i], normal)
+        _shift(x, a, -s * inverse_mass[a] * wa, normal)
+        _shift(x, b, -s * inverse_mass[b] * wb, normal)
+        _shift(x, d, -s * inverse_mass[d] * wd, normal)
 
 
 @numba.njit(cache=True)
@@ -226,9 +207,7 @@ def refresh_points(
     `normal` (N, 3) keeps the direction from the skin to each point as of the point's last query; that of the `stale`
     points is computed here.
     """
-    n = x.shape[0]
-    for s in range(stale.shape[0]):
-        i = stale[s]
+    for i in stale:
         f = face[i]
         if f < 0:
             continue
@@ -244,36 +223,28 @@ def refresh_points(
             for k in range(3):
                 normal[i, k] *= sign / length
         else:  # on the skin the difference has no direction: the face's normal
-            ux, uy, uz = body[b, 0] - body[a, 0], body[b, 1] - body[a, 1], body[b, 2] - body[a, 2]
-            vx, vy, vz = body[c, 0] - body[a, 0], body[c, 1] - body[a, 1], body[c, 2] - body[a, 2]
-            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            area = np.sqrt(nx * nx + ny * ny + nz * nz) + _TINY
-            normal[i, 0], normal[i, 1], normal[i, 2] = nx / area, ny / area, nz / area
-    count = 0
-    for i in range(n):
-        if face[i] >= 0 and asked_distance[i] < near + near:
-            count += 1
-    which = np.empty(count, np.int32)
-    point = np.empty((count, 3), np.float32)
-    out_normal = np.empty((count, 3), np.float32)
-    out_motion = np.zeros((count, 3), np.float32)
-    count = 0
-    for i in range(n):
-        if face[i] >= 0 and asked_distance[i] < near + near:
-            f = face[i]
-            which[count] = i
-            for k in range(3):
-                skin = np.float32(0.0)
-                moved = np.float32(0.0)
-                for corner in range(3):
-                    skin += weights[i, corner] * body[body_faces[f, corner], k]
-                    if moving:
-                        moved += weights[i, corner] * motion[body_faces[f, corner], k]
-                point[count, k] = skin
-                out_normal[count, k] = normal[i, k]
-                out_motion[count, k] = moved
-            count += 1
-    return which, point, out_normal, out_motion
+            across = _cross(_between(body, b, a), _between(body, c, a))
+            area = np.sqrt(_dot(across, across)) + _TINY
+            normal[i, 0], normal[i, 1], normal[i, 2] = across[0] / area, across[1] / area, across[2] / area
+    which = np.flatnonzero((face >= 0) & (asked_distance < near + near)).astype(np.int32)
+    point = np.zeros((len(which), 3), np.float32)
+    out_motion = np.zeros((len(which), 3), np.float32)
+    for s, i in enumerate(which):
+        f = face[i]
+        for k in range(3):
+            for corner in range(3):
+                point[s, k] += weights[i, corner] * body[body_faces[f, corner], k]
+                if moving:
+                    out_motion[s, k] += weights[i, corner] * motion[body_faces[f, corner], k]
+    return which, point, normal[which], out_motion
+
+
+@numba.njit(cache=True, fastmath=True)
+def _is_candidate(x: _Floats, rest: _Floats, i: int, here: _Floats, s: int, near2: float, apart2: float) -> np.bool_:
+    """Whether a face is near vertex i, and apart at rest; column s of `here` (6, F) has its centre, now and at rest."""
+    p = (x[i, 0] - here[0, s], x[i, 1] - here[1, s], x[i, 2] - here[2, s])
+    q = (rest[i, 0] - here[3, s], rest[i, 1] - here[4, s], rest[i, 2] - here[5, s])
+    return (_dot(p, p) <= near2) & (_dot(q, q) >= apart2)
 
 
 @numba.njit(cache=True, fastmath=True)
@@ -317,7 +288,6 @@ def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, 
         member[s] = f
         for k in range(6):
             here[k, s] = centre[f, k]
-    cx, cy, cz, rx, ry, rz = here[0], here[1], here[2], here[3], here[4], here[5]
 
     vertex = np.empty(4096, np.int32)
     face = np.empty(4096, np.int32)
@@ -334,16 +304,11 @@ def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, 
                 first, last = np.uint64(start[row - 1]), np.uint64(start[row + 2])  # three consecutive cells
                 hits = 0  # counted first, without a branch: nearly all rows have none
                 for s in range(first, last):
-                    px, py, pz = x[i, 0] - cx[s], x[i, 1] - cy[s], x[i, 2] - cz[s]
-                    qx, qy, qz = rest[i, 0] - rx[s], rest[i, 1] - ry[s], rest[i, 2] - rz[s]
-                    is_near = px * px + py * py + pz * pz <= cell2
-                    hits += is_near & (qx * qx + qy * qy + qz * qz >= apart2)
+                    hits += int(_is_candidate(x, rest, i, here, s, cell2, apart2))
                 if hits == 0:
                     continue
                 for s in range(first, last):
-                    px, py, pz = x[i, 0] - cx[s], x[i, 1] - cy[s], x[i, 2] - cz[s]
-                    qx, qy, qz = rest[i, 0] - rx[s], rest[i, 1] - ry[s], rest[i, 2] - rz[s]
-                    if px * px + py * py + pz * pz > cell2 or qx * qx + qy * qy + qz * qz < apart2:
+                    if not _is_candidate(x, rest, i, here, s, cell2, apart2):
                         continue
                     if count == len(vertex):
                         vertex = np.concatenate((vertex, np.empty(count, np.int32)))
@@ -367,11 +332,9 @@ def near_pairs(x: _Floats, faces: _Ints, vertex: _Ints, face: _Ints, reach: floa
     for s in range(n):
         i, f = vertex[s], face[s]
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-        vx, vy, vz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        height = (x[i, 0] - x[a, 0]) * nx + (x[i, 1] - x[a, 1]) * ny + (x[i, 2] - x[a, 2]) * nz
-        if abs(height) < reach * np.sqrt(nx * nx + ny * ny + nz * nz):
+        normal = _cross(_between(x, b, a), _between(x, c, a))
+        height = _dot(_between(x, i, a), normal)
+        if abs(height) < reach * np.sqrt(_dot(normal, normal)):
             which[count] = s
             side[count] = 1.0 if height >= 0 else -1.0
             count += 1

@@ -100,7 +100,7 @@ class Simulator(ABC):
         """Shape of a row's garment."""
         return (self.garment.n_vertices, 3)
 
-    def block(self, slots: list[int]) -> list[dict[str, Any]]:
+    def __call__(self, slots: list[int]) -> list[dict[str, Any]]:
         """The rows of some slots."""
         return [self.simulate(slot) for slot in slots]
 

@@ -17,35 +17,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core.backbones import (
-    BasisDecoder,
-    Controls,
-    TailorNet,
-    TailorNetConfig,
-    build_backbone,
-    load_backbone,
-    require_basis,
-    save_backbone,
-    save_basis,
-)
+from refu_core import backbones as nets
 from refu_core.body import SmplBody, load_fit
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment, worn_on
 from refu_core.modes import SdfMode
 from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
-from refu_core.training._data import (
-    Mirror,
-    SurfaceMixture,
-    TrainingSamples,
-    TrainingSet,
-    backbone_figures,
-    in_chunks,
-    mirrored,
-    mpve,
-    principal_components,
-    read_samples,
-)
+from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
 from refu_core.training._pretrain import code_loss
 from refu_core.weights import load_weights, save_weights
@@ -99,18 +78,18 @@ class Carried:
         self, related: GarmentTemplate, garment: GarmentTemplate, body: SmplBody, settings: CarrySettings
     ) -> None:
         """For `garment` on its `body`. Raises `WeightsError` when no networks of `related` ship."""
-        self.network = load_backbone("tailornet", related, mode=SdfMode.HYBRID)
+        self.network = nets.load_backbone("tailornet", related, mode=SdfMode.HYBRID)
         fit = None if garment.body == related.body else load_fit(garment.body)
         self._betas = None if fit is None else fit.difference(related.body).betas
         worn = worn_on(related, fit)
         vertices = garment.v_template.double().numpy()
-        nearest, place, distance = SurfaceMixture.nearest(worn, vertices)
+        nearest, place, distance = data.SurfaceMixture.nearest(worn, vertices)
         share = _smooth((settings.reach + settings.fade - distance) / settings.fade)
         # Trousers go on where shorts end: if they followed the hem that swings there, they would have a step.
         ends = _from_rim(worn, place)
         goes_on = _smooth((_from_rim(garment, vertices) - ends) / settings.hem)
         share *= 1 - goes_on * _smooth(1 - ends / settings.hem)
-        self._mixed = SurfaceMixture(nearest.corners, nearest.weights * torch.as_tensor(share)[:, None])
+        self._mixed = data.SurfaceMixture(nearest.corners, nearest.weights * torch.as_tensor(share)[:, None])
         self._garment, self._body = garment, body
         kept = torch.as_tensor(1 - share, dtype=torch.float32)[:, None]
         self._posed_as = replace(garment, weights=self._mixed(worn.weights[None])[0] + kept * garment.weights)
@@ -127,7 +106,7 @@ class Carried:
             posed = self._posed_as.pose(rest + self._mixed(there), transforms)
             return self._garment.unpose(posed, transforms) - rest
 
-        return in_chunks(one, betas, pose, size=32)
+        return data.in_chunks(one, betas, pose, size=32)
 
 
 def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -163,26 +142,26 @@ def carry_over(
         WeightsError: no networks of the related garment ship, or `output` can't be written.
     """
     settings, output = settings or CarrySettings(), Path(output)
-    require_basis(output, None, written=[f"tailornet-{mode}" for mode in SdfMode])
-    opened = TrainingSet.of(garment, dataset, body)
+    nets.require_basis(output, None, written=[f"tailornet-{mode}" for mode in SdfMode])
+    opened = data.TrainingSet.of(garment, dataset, body)
     template, body = opened.garment, opened.body
-    test = read_samples(opened.rows, body, template, split="test")
+    test = data.read_samples(opened.rows, body, template, split="test")
     carried = Carried(load_garment(like), template, body, settings)
-    samples = opened.samples.joined(mirrored(opened.samples, Mirror.of(template)))
-    controls = Controls.spread(template, settings.controls)
+    samples = opened.samples.joined(data.mirrored(opened.samples, data.Mirror.of(template)))
+    controls = nets.Controls.spread(template, settings.controls)
     share = _borne_out(carried(samples.betas, samples.pose), samples.displacement, controls)
     drawn = _bodies(opened.samples, settings)
     there = share[:, None] * carried(*drawn)
     # As many of each: the folds of the samples need components of their own.
     basis = _smooth_basis(torch.cat((samples.displacement, there[: len(samples)])), controls, settings.rank)
     described = {**opened.identity, "samples": len(samples), "simulated": len(opened.samples), "like": like}
-    save_basis(output, basis, {**described, "set": len(opened.rows)})
+    nets.save_basis(output, basis, {**described, "set": len(opened.rows)})
 
-    config = TailorNetConfig(template.card.joints, low=settings.hidden, high=(), style_shape=(), dropout=0.0)
+    config = nets.TailorNetConfig(template.card.joints, low=settings.hidden, high=(), style_shape=(), dropout=0.0)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
-        model = build_backbone(config, template, basis=basis, pivots=torch.zeros(1, N_BETAS + N_STYLES))
-    assert isinstance(model, TailorNet)
+        model = nets.build_backbone(config, template, basis=basis, pivots=torch.zeros(1, N_BETAS + N_STYLES))
+    assert isinstance(model, nets.TailorNet)
     with torch.no_grad():  # one pivot: there is nothing to choose between
         for parameter in (*model.style_shape.parameters(), *model.high.parameters()):
             parameter.zero_()
@@ -201,13 +180,13 @@ def carry_over(
         "settings": asdict(settings),
         "dataset": opened.card,
         "figures": {
-            **backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
-            "carried_mm": mpve(carried(test.betas, test.pose), test, body, template),
+            **data.backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
+            "carried_mm": data.mpve(carried(test.betas, test.pose), test, body, template),
             "borne_out": round(float(share.mean()), 3),
         },
     }
     base = f"tailornet-{BASE}"
-    save_backbone(output / base, model, {**card, "mode": str(BASE)})
+    nets.save_backbone(output / base, model, {**card, "mode": str(BASE)})
     stored = load_weights(output / base).card
     for mode in SdfMode:
         if mode is not BASE:
@@ -216,7 +195,7 @@ def carry_over(
     return {**card, "mode": str(BASE)}
 
 
-def _borne_out(carried: Tensor, truth: Tensor, controls: Controls) -> Tensor:
+def _borne_out(carried: Tensor, truth: Tensor, controls: nets.Controls) -> Tensor:
     """How much of what is carried over (N, V, 3) varies as the truth does, from 0 to 1, smoothly over the cloth, (V,).
 
     A sleeve moves as the related garment's does; a hem that is cut wider may not. It is found by least squares in each
@@ -227,22 +206,21 @@ def _borne_out(carried: Tensor, truth: Tensor, controls: Controls) -> Tensor:
     field = controls.matrix()
     near = field.clamp_min(0).T / field.clamp_min(0).sum(0)[:, None]
     least = _DOUBT * own.mean() + torch.finfo().tiny
-    share: Tensor = (field @ ((near @ common) / (near @ own + least))).clamp(0, 1)
-    return share
+    return (field @ ((near @ common) / (near @ own + least))).clamp(0, 1)
 
 
-def _smooth_basis(displacement: Tensor, controls: Controls, rank: int) -> BasisDecoder:
+def _smooth_basis(displacement: Tensor, controls: nets.Controls, rank: int) -> nets.BasisDecoder:
     """The output basis of displacements (N, V, 3) [m], limited to fields that `controls` can represent."""
     field = controls.matrix()
     smooth, triangle = torch.linalg.qr(field)
     at = torch.einsum("vc,nvk->nck", smooth, displacement)
-    mean, components = principal_components(at, rank=rank)  # orthonormal columns: as over all vertices
+    mean, components = data.principal_components(at, rank=rank)  # orthonormal columns: as over all vertices
     both = torch.cat((mean.flatten()[None], components)).view(-1, *mean.shape)
     mean, components = torch.linalg.solve_triangular(triangle, both, upper=True).flatten(1).tensor_split((1,))
-    return BasisDecoder(mean.view(-1, 3), components, controls=controls)
+    return nets.BasisDecoder(mean.view(-1, 3), components, controls=controls)
 
 
-def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, Tensor]:
+def _bodies(samples: data.TrainingSamples, settings: CarrySettings) -> tuple[Tensor, Tensor]:
     """β (P, 10) and θ (P, 24, 3) [rad] to query a network at: poses near the set's, and any that joints allow."""
     rng = np.random.default_rng(settings.loop.seed)
     known = samples.pose.numpy()[rng.integers(len(samples), size=settings.poses)]
@@ -254,11 +232,11 @@ def _bodies(samples: TrainingSamples, settings: CarrySettings) -> tuple[Tensor, 
 
 
 def _of_carried(
-    model: TailorNet, garment: GarmentTemplate, betas: Tensor, pose: Tensor, there: Tensor, steps: int
+    model: nets.TailorNet, garment: GarmentTemplate, betas: Tensor, pose: Tensor, there: Tensor, steps: int
 ) -> TrainingStage:
     """Teaches the low-frequency net what is carried over, `there` (P, V, 3) [m], to these bodies."""
     x, s = model.features(pose), torch.cat((betas, betas.new_zeros(len(betas), N_STYLES)), 1)
-    code = in_chunks(model.decoder.encode, there, size=256)
+    code = data.in_chunks(model.decoder.encode, there, size=256)
     bounded = model.features.are_bounded(garment)
     model.low.standardise(torch.cat((x, s), 1), model.features.groups, is_bounded=bounded)
     model.low.scale[-N_STYLES:] = 0  # a garment of one style ignores γ
@@ -268,10 +246,10 @@ def _of_carried(
 
 
 @torch.no_grad()
-def _add_linear(model: TailorNet, samples: TrainingSamples, ridge: float) -> None:
+def _add_linear(model: nets.TailorNet, samples: data.TrainingSamples, ridge: float) -> None:
     """Fits the high-frequency net, a single layer, to what the low-frequency one doesn't explain of the samples."""
     model.eval()
-    assert isinstance(model.decoder, BasisDecoder)
+    assert isinstance(model.decoder, nets.BasisDecoder)
     x = model.features(samples.pose)
     left = model.decoder.encode(samples.displacement) - model.low_code(x, samples.style_shape)
     middle, mean = x.mean(0), left.mean(0)

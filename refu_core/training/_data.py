@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,13 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core.backbones import Backbone, BasisDecoder, style_shape
+from refu_core.backbones import Backbone, BasisDecoder, TailorNet, backbone_from_weights, style_shape
 from refu_core.body import MIRRORED_JOINTS, Collider, SmplBody, load_body
 from refu_core.errors import GarmentError, RefuError
 from refu_core.garments import GarmentTemplate, SkinBelow, load_garment
 from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, dequantise, open_dataset
+from refu_core.weights import load_weights
 
 MAX_ASYMMETRY = 5e-3
 """A template that is anywhere farther than this from its mirror image counts as asymmetric [m]."""
@@ -154,6 +155,17 @@ class TrainingSet:
         """What the card of the weights says about the set."""
         return {key: self.rows.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")}
 
+    def tailornet(self, folder: Path, mode: str) -> tuple[TailorNet, Mapping[str, Any]]:
+        """The garment's trained tailornet in `folder`, and its card.
+
+        Raises `WeightsError` for none there, or a damaged one, and `RefuError` for another backbone.
+        """
+        stored = load_weights(folder / f"tailornet-{mode}", expect=self.identity)
+        found = backbone_from_weights(stored, self.garment)
+        if not isinstance(found, TailorNet):
+            raise RefuError(f"{stored.path}: wanted a tailornet, got {type(found).__name__}")
+        return found, stored.card
+
     @property
     def n_pivots(self) -> int:
         """How many pairs of the plan have many poses each. Raises `RefuError` for a card without a valid number."""
@@ -180,8 +192,7 @@ class TakenAlong:
     def added(self, sign: int, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
         """Displacements (B, N, 3) [m] with it, or, with a `sign` of -1, simulated ones without it."""
         garment, shape = self._garment, self._body.shape(betas)
-        _, at_root = RootTurn.taken_off(pose, shape.joints)
-        posed = self._body.posed(at_root, shape)
+        posed = self._body.posed(RootTurn.taken_off(pose, shape.joints)[1], shape)
         shift = self._below(self._collider(posed.vertices, posed.transforms) - posed.vertices)
         rest = garment.rest(betas, garment.own(style))
         vertices = garment.pose(rest + displacement, posed.transforms) + sign * shift

@@ -11,27 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core.backbones import Dynamics, DynamicsConfig, TailorNet, backbone_from_weights, save_dynamics
+from refu_core.backbones import Dynamics, DynamicsConfig, TailorNet, save_dynamics
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.history import PoseHistory
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import (
-    Mirror,
-    TrainingSamples,
-    TrainingSet,
-    in_chunks,
-    mirror_pose,
-    mirrored,
-    mpve,
-    read_samples,
-    split_validation,
-)
+from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._pretrain import code_loss
-from refu_core.weights import load_weights
 
 
 @dataclass(frozen=True)
@@ -92,36 +81,32 @@ def train_dynamics(
             a checkpoint there is of another training.
         WeightsError: no tailornet there, or a damaged one.
     """
-    opened = TrainingSet.of(garment, dataset, body)
+    opened = data.TrainingSet.of(garment, dataset, body)
     template, body, rows, folder = opened.garment, opened.body, opened.rows, Path(folder)
     if not isinstance(rows, GarmentSequences):
         msg = f"dynamics are learnt from sequences, got samples at rest: refu simulate {template.name} --sequences"
         raise RefuError(msg)
-    test = read_samples(rows, body, template, split="test")  # a missing test split is reported before any work
-    stored = load_weights(folder / f"tailornet-{mode}", expect=opened.identity)
-    still = backbone_from_weights(stored, template)
-    if not isinstance(still, TailorNet):
-        raise RefuError(f"{stored.path}: wanted a tailornet, got {type(still).__name__}")
-    settings = DynamicsSettings() if settings is None else settings
+    test = data.read_samples(rows, body, template, split="test")  # a missing test split is reported before any work
+    still, card_of_still = opened.tailornet(folder, mode)
+    settings = settings or DynamicsSettings()
     torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         dynamics = Dynamics(DynamicsConfig(still.config.joints), still)
-    mirror = Mirror.of(template)
+    mirror = data.Mirror.of(template)
     plain = _prepared(still, opened.samples, _pasts(rows, rows.train))
-    turned = _prepared(still, mirrored(opened.samples, mirror), _pasts(rows, rows.train, is_mirrored=True))
+    turned = _prepared(still, data.mirrored(opened.samples, mirror), _pasts(rows, rows.train, is_mirrored=True))
     train, validation = _split(opened.samples, (plain, turned), settings)
     dynamics.standardise(*train[:3], still.features.are_bounded(template))
     described = {
         **opened.identity,
         "mode": mode,
-        "tailornet_sha256": stored.card["sha256"],
+        "tailornet_sha256": card_of_still["sha256"],
         "settings": asdict(settings),
         "samples": len(train.code),
     }
     identity = [described, asdict(dynamics.config)]
     loop = Loop(dynamics, settings.loop, folder / "dynamics", identity, torch_device, quiet=quiet)
-    dynamics.to(torch_device)
 
     def predict(x: Tensor, s: Tensor, past: Tensor) -> Tensor:
         if dynamics.training:
@@ -147,7 +132,7 @@ def _pasts(dataset: GarmentSequences, rows: NDArray[np.bool_], *, is_mirrored: b
         sequence = dataset.sequence(int(row))
         poses, transl = sequence.pose, sequence.transl.astype(np.float64)
         if is_mirrored:
-            poses, transl = mirror_pose(torch.as_tensor(poses)).numpy(), transl * (-1, 1, 1)
+            poses, transl = data.mirror_pose(torch.as_tensor(poses)).numpy(), transl * (-1, 1, 1)
         frames = PoseHistory.told(
             SmplFrame(pose, transl=at, stamp_ns=round(1e9 * t / sequence.fps))
             for t, (pose, at) in enumerate(zip(poses, transl, strict=True))
@@ -157,20 +142,20 @@ def _pasts(dataset: GarmentSequences, rows: NDArray[np.bool_], *, is_mirrored: b
 
 
 @torch.no_grad()
-def _prepared(still: TailorNet, samples: TrainingSamples, past: Tensor) -> _Prepared:
+def _prepared(still: TailorNet, samples: data.TrainingSamples, past: Tensor) -> _Prepared:
     def owed(pose: Tensor, style_shape: Tensor, displacement: Tensor) -> Tensor:
         return still.decoder.encode(displacement) - still.code(still.features(pose), style_shape)
 
-    code = in_chunks(owed, samples.pose, samples.style_shape, samples.displacement)
-    return _Prepared(in_chunks(still.features, samples.pose), samples.style_shape, past, code)
+    code = data.in_chunks(owed, samples.pose, samples.style_shape, samples.displacement)
+    return _Prepared(data.in_chunks(still.features, samples.pose), samples.style_shape, past, code)
 
 
 def _split(
-    samples: TrainingSamples, prepared: tuple[_Prepared, _Prepared], settings: DynamicsSettings
+    samples: data.TrainingSamples, prepared: tuple[_Prepared, _Prepared], settings: DynamicsSettings
 ) -> tuple[_Prepared, _Prepared]:
     """Samples to learn from, mirrored ones included, and samples for validation."""
     which = replace(samples, displacement=torch.arange(len(samples)))  # sample numbers, to split those
-    train, validation = split_validation(which, share=settings.validation_share, seed=settings.loop.seed)
+    train, validation = data.split_validation(which, share=settings.validation_share, seed=settings.loop.seed)
     plain, turned = prepared
     to_learn = [torch.cat((a[train.displacement], b[train.displacement])) for a, b in zip(plain, turned, strict=True)]
     return _Prepared(*to_learn), _Prepared(*(one[validation.displacement] for one in plain))
@@ -180,7 +165,7 @@ def _split(
 def _figures(
     still: TailorNet,
     dynamics: Dynamics,
-    test: TrainingSamples,
+    test: data.TrainingSamples,
     prepared: _Prepared,
     body: SmplBody,
     garment: GarmentTemplate,
@@ -191,7 +176,7 @@ def _figures(
         displacement: Tensor = still.decoder(still.code(still.features(pose), style_shape) + owed)
         return displacement
 
-    moved = in_chunks(dynamics, *prepared[:3])
+    moved = data.in_chunks(dynamics, *prepared[:3])
     owed = {"mpve_mm": moved, "still_mm": torch.zeros_like(moved), "basis_mm": prepared.code}
-    garments = {name: in_chunks(predicted, test.pose, prepared.style_shape, code) for name, code in owed.items()}
-    return {"samples": len(test), **{name: mpve(one, test, body, garment) for name, one in garments.items()}}
+    garments = {name: data.in_chunks(predicted, test.pose, prepared.style_shape, code) for name, code in owed.items()}
+    return {"samples": len(test), **{name: data.mpve(one, test, body, garment) for name, one in garments.items()}}

@@ -9,29 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from refu_core.backbones import (
-    Network,
-    backbone_config,
-    backbone_from_weights,
-    build_backbone,
-    save_backbone,
-    uses_basis,
-)
+from refu_core import backbones as nets
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import (
-    Mirror,
-    TakenAlong,
-    TrainingSamples,
-    TrainingSet,
-    in_chunks,
-    mirrored,
-    split_validation,
-)
+from refu_core.training import _data as data
 from refu_core.training._dresser import Dresser, Sdf, refu_loss
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages
@@ -127,32 +112,32 @@ def finetune(
     if mode not in _MODES:
         raise RefuError(f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}")
     settings = settings or FinetuneSettings.of(backbone, preset)
-    opened = TrainingSet.of(garment, dataset, body)
+    opened = data.TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     torch_device, output = start_parallel(device), Path(output)
     stem = output / f"{backbone}-{mode}"
-    train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
+    train, validation = data.split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
-        train = train.joined(mirrored(train, Mirror.of(template)))
-    network: Network
+        train = train.joined(data.mirrored(train, data.Mirror.of(template)))
+    network: nets.Network
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         if weights is None:
-            config = backbone_config(backbone, template, preset=preset)
-            basis = basis_of(output, opened, None, PretrainSettings().rank) if uses_basis(config, preset) else None
-            network = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
+            config = nets.backbone_config(backbone, template, preset=preset)
+            basis = basis_of(output, opened, None, PretrainSettings().rank) if nets.uses_basis(config, preset) else None
+            network = nets.build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
             # Called because it sets the scale of inputs and outputs; the stages themselves aren't run.
             stages(network, train, validation, template, PretrainSettings())
         else:
             stored = load_weights(Path(weights) / f"{backbone}-none", expect=identity)
-            network = backbone_from_weights(stored, template)
+            network = nets.backbone_from_weights(stored, template)
             bring_basis(Path(weights), output, written=stem.name)
         refu = _layer(mode, settings, template.n_vertices)
     described = {**identity, "backbone": backbone, "preset": preset, "mode": mode, "settings": asdict(settings)}
     described |= {"samples": len(train), "from_scratch": weights is None}
     in_refu, in_loss, _ = _MODES[mode]
     garment, there = template.to(device=torch_device), body.to(device=torch_device)
-    dresser = Dresser(network, refu, garment, there, in_refu, in_loss, is_blended=settings.is_blended).to(torch_device)
+    dresser = Dresser(network, refu, garment, there, in_refu, in_loss, is_blended=settings.is_blended)
     loop = Loop(dresser, settings.loop, stem, described, torch_device, quiet=quiet)
 
     def loss(dressed: Tensor, truth: Tensor) -> Tensor:
@@ -160,22 +145,22 @@ def finetune(
         return _UNIT * refu_loss(dressed[..., :3], truth, dressed[..., 3])
 
     objective = Objective([dresser], dresser, loss)
-    data = [_tensors(part, body, template) for part in (train, validation)]
-    loop.run(TrainingStage("refu", objective, settings.steps, train=data[0], validation=data[1]))
+    parts = [_tensors(part, body, template) for part in (train, validation)]
+    loop.run(TrainingStage("refu", objective, settings.steps, *parts))
     dresser.to("cpu").eval()
     card = described | {"refu": refu.config if refu else None, "dataset": opened.card}
     card["knows_limbs"] = opened.knows_limbs
     if is_writer():
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")
-        save_backbone(stem, network, card, others=others, half=preset != "paper")
+        nets.save_backbone(stem, network, card, others=others, half=preset != "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
 @torch.no_grad()
-def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
+def _tensors(samples: data.TrainingSamples, body: SmplBody, garment: GarmentTemplate) -> tuple[Tensor, ...]:
     """The data that the loop draws from: β, θ, γ and the posed true garments [m], shape (N, V, 3)."""
-    along = TakenAlong(body, garment)
+    along = data.TakenAlong(body, garment)
 
     def posed(displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
         rest = garment.rest(betas, garment.own(style))
@@ -183,7 +168,7 @@ def _tensors(samples: TrainingSamples, body: SmplBody, garment: GarmentTemplate)
         return garment.pose(rest + whole, body(pose, betas).transforms)
 
     inputs = samples.betas, samples.pose, samples.style
-    whole = in_chunks(posed, samples.displacement, *inputs) if len(samples) else samples.displacement
+    whole = data.in_chunks(posed, samples.displacement, *inputs) if len(samples) else samples.displacement
     return *inputs, whole
 
 

@@ -95,10 +95,11 @@ class Loop:
             self._resumed = saved["stage"]
 
     def run(self, stage: TrainingStage) -> None:
-        """Trains a stage, or what is left of it.
+        """Trains a stage, or what is left of it, on the device, where the model stays.
 
         The model ends with the stage's best weights by validation, or with its last ones where no samples are held out.
         """
+        self._model.to(self._device)
         if stage.name in self._done:
             return
         rank, world = ranks()
@@ -225,9 +226,7 @@ def ranks() -> tuple[int, int]:
 
 def _schedule(step: int, steps: int) -> float:
     warm = max(1, steps // 20)
-    if step < warm:
-        return (step + 1) / warm
-    return cosine(step - warm, steps - warm)
+    return (step + 1) / warm if step < warm else cosine(step - warm, steps - warm)
 
 
 def cosine(step: int, steps: int) -> float:

@@ -9,36 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from refu_core.backbones import (
-    Backbone,
-    BasisDecoder,
-    Lying,
-    LyingConfig,
-    TailorNet,
-    WithLying,
-    backbone_from_weights,
-    lying_share,
-    save_lying,
-    up_in_root,
-)
+from refu_core import backbones as nets
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import (
-    Mirror,
-    TrainingSet,
-    displacements,
-    mirrored,
-    mpve,
-    principal_components,
-    read_samples,
-    split_validation,
-)
+from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._pretrain import code_loss
 from refu_core.training._rehearsal import Rehearsal
-from refu_core.weights import load_weights
 
 
 @dataclass(frozen=True)
@@ -84,29 +63,26 @@ def train_lying(
             there is of another training.
         WeightsError: no tailornet there, or a damaged one.
     """
-    opened = TrainingSet.of(garment, dataset, body, who=_lie)
+    opened = data.TrainingSet.of(garment, dataset, body, who=_lie)
     template, body, folder = opened.garment, opened.body, Path(folder)
-    test = read_samples(opened.rows, body, template, split="test", who=_lie)
+    test = data.read_samples(opened.rows, body, template, split="test", who=_lie)
     samples = opened.samples
     if not len(samples) or not len(test):
         msg = f"wanted lying people to learn from and to test on, the set of {template.name} has {len(samples)} and "
         raise RefuError(f"{msg}{len(test)}: refu simulate --postures")
-    stored = load_weights(folder / f"tailornet-{mode}", expect=opened.identity)
-    upright = backbone_from_weights(stored, template).requires_grad_(False)
-    if not isinstance(upright, TailorNet):
-        raise RefuError(f"{stored.path}: wanted a tailornet, got {type(upright).__name__}")
-    settings = LyingSettings() if settings is None else settings
+    upright, card_of_upright = opened.tailornet(folder, mode)
+    settings = settings or LyingSettings()
     torch_device = start_parallel(device)
-    train, validation = split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
-    train = train.joined(mirrored(train, Mirror.of(template)))
-    owed = [one.displacement - displacements(upright, one) for one in (train, validation)]
+    train, validation = data.split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
+    train = train.joined(data.mirrored(train, data.Mirror.of(template)))
+    owed = [one.displacement - data.displacements(upright, one) for one in (train, validation)]
     # With both signs the mean is zero, so that nothing can be added.
-    mean, components = principal_components(torch.cat((owed[0], -owed[0])), rank=settings.rank)
-    decoder = BasisDecoder(torch.zeros_like(mean), components)
+    mean, components = data.principal_components(torch.cat((owed[0], -owed[0])), rank=settings.rank)
+    decoder = nets.BasisDecoder(torch.zeros_like(mean), components)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
-        lying = Lying(LyingConfig(upright.config.joints), decoder)
-    rehearsed = rehearsal.of(stored.card, upright, known=opened.card["plan"])
+        lying = nets.Lying(nets.LyingConfig(upright.config.joints), decoder)
+    rehearsed = rehearsal.of(card_of_upright, upright, known=opened.card["plan"])
     rehearsed = rehearsed.take(_lie(rehearsed.pose))
     owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
     parts = [
@@ -118,24 +94,23 @@ def train_lying(
     described = {
         **opened.identity,
         "mode": mode,
-        "tailornet_sha256": stored.card["sha256"],
+        "tailornet_sha256": card_of_upright["sha256"],
         "settings": asdict(settings),
         "samples": len(train),
         "rehearsed": len(rehearsed),
     }
     loop = Loop(lying, settings.loop, folder / "lying", [described, asdict(lying.config)], torch_device, quiet=quiet)
-    lying.to(torch_device)
     loop.run(TrainingStage("lying", Objective([lying], lying, code_loss(lying)), settings.steps, *parts))
     lying.to("cpu").eval()
-    both: dict[str, Backbone] = {"mpve_mm": WithLying(upright, lying), "upright_mm": upright}
-    figures = {name: mpve(displacements(one, test), test, body, template) for name, one in both.items()}
+    both: dict[str, nets.Backbone] = {"mpve_mm": nets.WithLying(upright, lying), "upright_mm": upright}
+    figures = {name: data.mpve(data.displacements(one, test), test, body, template) for name, one in both.items()}
     card = {**described, "dataset": opened.card, "figures": {"samples": len(test), **figures}}
     if is_writer():
-        save_lying(folder, lying, card)
+        nets.save_lying(folder, lying, card)
         loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
 def _lie(pose: Tensor) -> Tensor:
     """Which of some people (N, 24, 3) lie, or nearly, shape (N,)."""
-    return lying_share(up_in_root(pose)) > 0
+    return nets.lying_share(nets.up_in_root(pose)) > 0

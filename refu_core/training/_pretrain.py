@@ -10,46 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from refu_core import backbones as nets
 from refu_core._files import replacing
-from refu_core.backbones import (
-    BackboneConfig,
-    BasisDecoder,
-    Gcnn,
-    LaplacianSmoothing,
-    Lying,
-    Mlp,
-    Network,
-    Perceptron,
-    PoseFeatures,
-    StackedPerceptrons,
-    TailorNet,
-    TailorNetConfig,
-    backbone_config,
-    backbone_from_weights,
-    build_backbone,
-    load_basis,
-    require_basis,
-    save_backbone,
-    save_basis,
-    uses_basis,
-)
 from refu_core.body import JOINT_NAMES, SmplBody
 from refu_core.errors import RefuError, WeightsError
 from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.simulation import GarmentDataset, GarmentSequences
-from refu_core.training._data import (
-    Mirror,
-    TrainingSamples,
-    TrainingSet,
-    backbone_figures,
-    in_chunks,
-    mirrored,
-    output_basis,
-    read_samples,
-    split_validation,
-)
+from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._rehearsal import Rehearsal, plans_of
 from refu_core.weights import load_weights
@@ -107,7 +76,7 @@ def pretrain(
     backbone: str = "tailornet",
     preset: str = "realtime",
     settings: PretrainSettings | None = None,
-    config: BackboneConfig | None = None,
+    config: nets.BackboneConfig | None = None,
     start: str | Path | None = None,
     mode: str = "none",
     joints: Sequence[int] = (),
@@ -144,35 +113,35 @@ def pretrain(
         RefuError: the set is of another garment or body or too small, or a checkpoint there is of another training.
         WeightsError: no such backbone or preset, or files in `output` are damaged or of another garment.
     """
-    opened = TrainingSet.of(garment, dataset, body)
+    opened = data.TrainingSet.of(garment, dataset, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
-    test = read_samples(opened.rows, body, template, split="test")  # a missing test split is reported first
+    test = data.read_samples(opened.rows, body, template, split="test")  # a missing test split is reported first
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
     if start is None and (rehearsal is not None or joints or mode != "none"):
         raise RefuError("there is nothing to go on from or to rehearse without weights to start from")
     torch_device, output = start_parallel(device), Path(output)
     stem = output / f"{backbone}-{mode}"
-    mirror = Mirror.of(template) if settings.is_mirrored else None
+    mirror = data.Mirror.of(template) if settings.is_mirrored else None
     # Which pairs are held out mustn't depend on what is made of the samples afterwards.
     # A rehearsing network can't stray far: with none of 500 samples held out, shorts' last weights are 0.2 mm nearer.
     held_out = 0.0 if rehearsal is not None else settings.validation_share
-    train, validation = split_validation(samples, share=held_out, seed=settings.loop.seed)
+    train, validation = data.split_validation(samples, share=held_out, seed=settings.loop.seed)
     if mirror is not None:
-        train = train.joined(mirrored(train, mirror))
+        train = train.joined(data.mirrored(train, mirror))
     described = {**identity, "backbone": backbone, "preset": preset}
     described |= {"settings": asdict(settings), "samples": len(train)}
     mean, stored = samples.displacement.mean(0), None
     if start is None:
-        config = backbone_config(backbone, template, preset=preset) if config is None else config
-        if settings.dropout is not None and isinstance(config, TailorNetConfig):
+        config = nets.backbone_config(backbone, template, preset=preset) if config is None else config
+        if settings.dropout is not None and isinstance(config, nets.TailorNetConfig):
             config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
-        basis = basis_of(output, opened, mirror, settings.rank) if uses_basis(config, preset) else None
+        basis = basis_of(output, opened, mirror, settings.rank) if nets.uses_basis(config, preset) else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.loop.seed)
-            model = build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
+            model = nets.build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
     else:
         stored = load_weights(Path(start) / f"{backbone}-{mode}", expect=identity)
-        model = backbone_from_weights(stored, template)
+        model = nets.backbone_from_weights(stored, template)
         config = model.config
         described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
         if rehearsal is not None:
@@ -187,9 +156,7 @@ def pretrain(
             config = model.config
         bring_basis(Path(start), output, written=stem.name)
     loop = Loop(model, settings.loop, stem, [described, asdict(config)], torch_device, quiet=quiet)
-    to_run = stages(model, train, validation, template, settings, goes_on=stored is not None)
-    model.to(torch_device)
-    for stage in to_run:
+    for stage in stages(model, train, validation, template, settings, goes_on=stored is not None):
         loop.run(stage)
     model.to("cpu").eval()
     card = {
@@ -197,26 +164,26 @@ def pretrain(
         "mode": mode,
         "dataset": opened.card,
         "knows_limbs": opened.knows_limbs,
-        "figures": backbone_figures(model, test, body, template, mean=mean),
+        "figures": data.backbone_figures(model, test, body, template, mean=mean),
     }
     if is_writer():
         refu = None if stored is None else refu_from_weights(stored)
         layer = None if refu is None else refu_tensors(refu, half=preset != "paper")
-        save_backbone(stem, model, card, others=layer, half=preset != "paper")
+        nets.save_backbone(stem, model, card, others=layer, half=preset != "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
-def basis_of(folder: Path, opened: TrainingSet, mirror: Mirror | None, rank: int) -> BasisDecoder:
+def basis_of(folder: Path, opened: data.TrainingSet, mirror: data.Mirror | None, rank: int) -> nets.BasisDecoder:
     """The folder's basis, made if there is none."""
     if (folder / "basis.json").exists():
-        return load_basis(folder, opened.garment, expect=opened.identity)[0]
+        return nets.load_basis(folder, opened.garment, expect=opened.identity)[0]
     displacement = opened.samples.displacement
     if mirror is not None:
-        displacement = torch.cat((displacement, mirrored(opened.samples, mirror).displacement))
-    basis = output_basis(displacement, rank=rank)
+        displacement = torch.cat((displacement, data.mirrored(opened.samples, mirror).displacement))
+    basis = data.output_basis(displacement, rank=rank)
     if is_writer():
-        save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": len(opened.rows)})
+        nets.save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": len(opened.rows)})
     return basis
 
 
@@ -228,7 +195,7 @@ def bring_basis(source: Path, target: Path, *, written: str) -> None:
     if not is_writer() or not (source / "basis.json").exists():
         return
     basis = load_weights(source / "basis")
-    require_basis(target, str(basis.card["sha256"]), written=(written,))
+    nets.require_basis(target, str(basis.card["sha256"]), written=(written,))
     for name in ("basis.safetensors", "basis.json"):
         there = target / name
         try:
@@ -241,7 +208,7 @@ def bring_basis(source: Path, target: Path, *, written: str) -> None:
             raise WeightsError(f"{there}: can't be written: {error.strerror or error}") from error
 
 
-def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:
+def pivots_of(samples: data.TrainingSamples, n_pivots: int) -> Tensor:
     """(β, γ) of a set's pivots, its first `n_pivots` pairs, shape (K, 14); of as many other pairs if it has none."""
     pairs = [k for k in torch.unique(samples.pair).tolist() if k < n_pivots]
     pairs = pairs or torch.unique(samples.pair)[:n_pivots].tolist()
@@ -249,9 +216,9 @@ def pivots_of(samples: TrainingSamples, n_pivots: int) -> Tensor:
 
 
 def stages(
-    model: Network,
-    train: TrainingSamples,
-    validation: TrainingSamples,
+    model: nets.Network,
+    train: data.TrainingSamples,
+    validation: data.TrainingSamples,
     garment: GarmentTemplate,
     settings: PretrainSettings,
     *,
@@ -259,7 +226,7 @@ def stages(
 ) -> list[TrainingStage]:
     """The stages to train, in order; for a network that `goes_on`, the last one alone."""
     take_inputs(model, train, garment, widen=goes_on)
-    if isinstance(model, Gcnn):
+    if isinstance(model, nets.Gcnn):
         if not goes_on:
             mean = train.displacement.mean(0)
             model.mean.copy_(mean)
@@ -268,17 +235,17 @@ def stages(
         objective = Objective([model], model, _vertex_loss)
         return [TrainingStage("all", objective, settings.steps, *parts)]
     inputs = [(model.features(s.pose), s.style_shape) for s in (train, validation)]
-    codes = [in_chunks(model.decoder.encode, s.displacement, size=256) for s in (train, validation)]
+    codes = [data.in_chunks(model.decoder.encode, s.displacement, size=256) for s in (train, validation)]
     loss = code_loss(model)
     both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
-    if isinstance(model, Mlp):
+    if isinstance(model, nets.Mlp):
         return [TrainingStage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
     joint = Objective([model.low, model.high], model.code, loss)
     together = TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)
     if goes_on:
         return [together]
 
-    smooth = LaplacianSmoothing(garment)
+    smooth = nets.LaplacianSmoothing(garment)
     coarse = [low_frequency_code(model, smooth, garment, s) for s in (train, validation)]
     drape = [(s, code) for _, s, code in both]
     low = [(x, s, code) for (x, s, _), code in zip(both, coarse, strict=True)]
@@ -297,7 +264,7 @@ def stages(
     return [*found, TrainingStage("high", Objective([model.high], model.high, loss), settings.steps, *fine)]
 
 
-def tell_of(model: Network, joints: Sequence[int], pose: Tensor) -> None:
+def tell_of(model: nets.Network, joints: Sequence[int], pose: Tensor) -> None:
     """Makes a network see further joints, without effect at first, in the range of the poses (N, 24, 3) [rad].
 
     Raises `RefuError` for joints that it sees already or that don't exist, and for a network of rotation vectors.
@@ -312,25 +279,25 @@ def tell_of(model: Network, joints: Sequence[int], pose: Tensor) -> None:
         msg += f"got {', '.join(JOINT_NAMES[j] if 0 <= j < N_JOINTS else str(j) for j in joints)}"
         raise RefuError(msg)
     model.config = replace(config, joints=(*config.joints, *joints))
-    model.features = PoseFeatures(model.config.joints, config.encoding)
+    model.features = nets.PoseFeatures(model.config.joints, config.encoding)
     further = model.features(pose)[:, before:]
     groups = torch.arange(further.shape[1]) // 9
     for net in _of_pose(model):
         net.take_in(further, groups, at=before)
 
 
-def _of_pose(model: Network) -> tuple[Perceptron | StackedPerceptrons, ...]:
+def _of_pose(model: nets.Network) -> tuple[nets.Perceptron | nets.StackedPerceptrons, ...]:
     """The networks whose first inputs are pose features."""
-    if isinstance(model, TailorNet):
+    if isinstance(model, nets.TailorNet):
         return model.low, model.high
-    return (model.head if isinstance(model, Gcnn) else model.net,)
+    return (model.head if isinstance(model, nets.Gcnn) else model.net,)
 
 
-def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate, *, widen: bool) -> None:
+def take_inputs(model: nets.Network, train: data.TrainingSamples, garment: GarmentTemplate, *, widen: bool) -> None:
     """Standardises a network's inputs by the samples; to `widen` a trained one, only extends the range that it sees."""
     x, s = model.features(train.pose), train.style_shape
     seen = [(net, x if net is getattr(model, "high", None) else torch.cat((x, s), 1)) for net in _of_pose(model)]
-    seen += [(model.style_shape, s)] if isinstance(model, TailorNet) else []
+    seen += [(model.style_shape, s)] if isinstance(model, nets.TailorNet) else []
     groups, bounded = model.features.groups, model.features.are_bounded(garment)
     for net, inputs in seen:
         n = inputs.shape[1]
@@ -342,14 +309,14 @@ def take_inputs(model: Network, train: TrainingSamples, garment: GarmentTemplate
             net.standardise(inputs, groups[:n], is_bounded=bounded[:n])
 
 
-def code_loss(model: TailorNet | Mlp | Lying) -> Callable[[Tensor, Tensor], Tensor]:
+def code_loss(model: nets.TailorNet | nets.Mlp | nets.Lying) -> Callable[[Tensor, Tensor], Tensor]:
     """What tells the distance between the garments of two codes [mm].
 
     Dense codes are vertices: L1, as in the original. In an orthonormal basis, distances between codes give root mean
     square distances of vertices; networks trained on these instead of on the L1 of vertices are as good in a quarter of
     the time.
     """
-    if not isinstance(model.decoder, BasisDecoder):
+    if not isinstance(model.decoder, nets.BasisDecoder):
         return _vertex_loss
     n = model.decoder.n_vertices
     return lambda predicted, target: 1e3 * (predicted - target).norm(dim=1).mean() / n**0.5
@@ -360,18 +327,18 @@ def _vertex_loss(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def low_frequency_code(
-    model: TailorNet, smooth: LaplacianSmoothing, garment: GarmentTemplate, samples: TrainingSamples
+    model: nets.TailorNet, smooth: nets.LaplacianSmoothing, garment: GarmentTemplate, samples: data.TrainingSamples
 ) -> Tensor:
     """Code of D_LF, shape (N, C): the smoothed garment minus its template (Patel et al. 2020)."""
     decoder = model.decoder
-    if isinstance(decoder, BasisDecoder):
+    if isinstance(decoder, nets.BasisDecoder):
         smoothed = smooth.transposed(decoder.components)
 
     def code(betas: Tensor, style: Tensor, displacement: Tensor) -> Tensor:
         rest = garment.rest(betas, garment.own(style))
         whole = rest + displacement
-        if isinstance(decoder, BasisDecoder):
+        if isinstance(decoder, nets.BasisDecoder):
             return whole.flatten(1) @ smoothed.T - (rest.flatten(1) + decoder.mean) @ decoder.components.T
         return decoder.encode(smooth(whole) - rest)
 
-    return in_chunks(code, samples.betas, samples.style, samples.displacement)
+    return data.in_chunks(code, samples.betas, samples.style, samples.displacement)

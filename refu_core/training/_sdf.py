@@ -213,7 +213,7 @@ def train_sdf(
 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        network = SdfNetwork(SDF_PRESETS[settings.preset]).to(where)
+        network = SdfNetwork(SDF_PRESETS[settings.preset])
     about = {"garment": garment.name, "samples": len(splits["train"])}
     identity = [asdict(settings), body.fingerprint, about]
     how = LoopSettings(settings.batch_size, settings.learning_rate, 0.0, settings.check_every, seed=settings.seed)

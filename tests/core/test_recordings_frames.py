@@ -241,6 +241,16 @@ def test_frames_of_torch_and_of_parameters(tmp_path: Path) -> None:
     same(read_motion(tmp_path / "a.pt", fps=30))
 
 
+@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("name", [None, "frames", "poses"])
+def test_an_array_that_holds_itself_is_no_motion(n: int, name: str | None, tmp_path: Path) -> None:
+    held = np.empty(n, object)
+    held[:] = [held] * n
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(held if name is None else {name: held}))
+    with pytest.raises(MotionFileError, match=r"no poses; wanted|an array of objects|several shapes"):
+        read_motion(tmp_path / "a.pkl", fps=30.0)
+
+
 def test_what_stands_beside_an_object_is_read(tmp_path: Path) -> None:
     """GRAB: rate and gender are arrays, the body is a dictionary that NumPy has pickled."""
     body = {"params": {"global_orient": POSES[:, 0], "body_pose": POSES[:, 1:22].reshape(T, 63), "transl": TRANSL}}
