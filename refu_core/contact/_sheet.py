@@ -15,7 +15,7 @@ from refu_core.mesh import Connectivity
 
 
 class Sheet:
-    """A mesh as kernels read it: places, box, normals and tree. The last two follow a pose when they are asked for."""
+    """A mesh as kernels read it: places, box, tree and normals. The last three follow a pose when they are asked for."""
 
     def __init__(self, mesh: Connectivity, rest: Tensor) -> None:
         """For a mesh with vertices (U, 3) [m] in the rest pose."""
@@ -25,7 +25,7 @@ class Sheet:
         self._normals = torch.empty_like(self.vertices)
         self._extent = memory(2, 3, device=rest.device)
         self.data = data = kernels.Below()
-        """The mesh as kernels read it; `fit` its tree and `point_out` its normals before they are needed."""
+        """The mesh as kernels read it; `fit` its box and tree and `point_out` its normals before they are needed."""
         data.points, data.normals, data.extent = (
             as_warp(tensor, wp.vec3) for tensor in (self.vertices, self._normals, self._extent)
         )
@@ -40,13 +40,13 @@ class Sheet:
         """Takes over a pose, (U, 3) [m]."""
         with torch_stream(self.vertices.device):
             self.vertices.copy_(vertices)
-            torch.aminmax(self.vertices, dim=0, out=(self._extent[0], self._extent[1]))
         self._has_late_tree = self._has_late_normals = True
 
     def fit(self) -> None:
-        """Fits the tree to the pose, once."""
+        """Fits box and tree to the pose, once."""
         if self._has_late_tree:
             with torch_stream(self.vertices.device):
+                torch.aminmax(self.vertices, dim=0, out=(self._extent[0], self._extent[1]))
                 self._tree.refit()
             self._has_late_tree = False
 
