@@ -119,8 +119,7 @@ def _finished_or_new(options: FleetOptions, recording: Input, path: Path) -> dic
 
 def _record_hash(record: dict[str, Any]) -> str:
     """Tells a record that was damaged, and so is worth nothing, whatever it says."""
-    content = {name: value for name, value in record.items() if name != "hash"}
-    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+    return _hash_of({name: value for name, value in record.items() if name != "hash"})
 
 
 def _require_free(options: FleetOptions, name: str, records: Folder) -> None:
@@ -208,7 +207,12 @@ def _key(options: FleetOptions, recording: Input, path: Path) -> str:
     """Hash of the recording, of how it is replayed, and of the code and weights."""
     read = (recording.name, _recording_hash(recording.source, path))
     told = (__version__, code_hash(*_CODE), *read, _content(options.replay))
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+    return _hash_of(told)
+
+
+def _hash_of(values: Any) -> str:
+    """Hash of plain values, as JSON has them."""
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 def _content(options: ReplayOptions) -> str:
