@@ -15,7 +15,7 @@ from refu_core.mesh import Connectivity
 
 
 class Sheet:
-    """A mesh as kernels read it: places, box, tree and normals. The last three follow a pose when they are asked for."""
+    """A mesh as kernels read it: places, box, tree and normals. These last three follow a pose when asked for."""
 
     def __init__(self, mesh: Connectivity, rest: Tensor) -> None:
         """For a mesh with vertices (U, 3) [m] in the rest pose."""
