@@ -11,7 +11,7 @@ from typing import Any
 from refu_core import RefuError, load_garment, training
 from refu_core._device import checked_device
 from refu_core._files import exclusive
-from refu_core.backbones import PRESETS
+from refu_core.backbones import KINDS, PRESETS
 from refu_core.body import JOINT_NAMES, load_fit
 from refu_core.errors import printable
 from refu_core.garments import worn_on
@@ -58,10 +58,11 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
     if options.network == "dynamics":
         moving = _seeded(training.DynamicsSettings(), options, **steps)
         return training.train_dynamics(*given, mode=options.mode, settings=moving, **common)
-    if options.network == "lying":
+    if options.network in KINDS:
         assert rehearsal is not None  # `_check` has seen to it
-        to_lie = _seeded(training.LyingSettings(), options, **steps)
-        return training.train_lying(*given, mode=options.mode, rehearsal=rehearsal, settings=to_lie, **common)
+        beyond = _seeded(training.BeyondSettings(), options, **steps)
+        common |= {"mode": options.mode, "rehearsal": rehearsal, "settings": beyond}
+        return training.train_beyond(options.network, *given, **common)
     if options.like is not None:
         few = _seeded(training.CarrySettings(), options, **steps)
         return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
@@ -100,8 +101,8 @@ def _check(options: TrainOptions) -> None:
         "--start goes on with networks as they are: leave --scale, --margin, --unblended, --network and --preset out": (
             options.start is not None and is_changed
         ),
-        "what lying people's cloth does is learnt beside what others' does: give --rehearse N, 8000 for instance": (
-            options.network == "lying" and options.rehearse is None
+        "what cloth does in such postures is learnt beside what others' does: give --rehearse N, 8000 for instance": (
+            options.network in KINDS and options.rehearse is None
         ),
         f"no preset {options.preset!r} of training: wanted {', '.join(presets)}": options.preset not in presets,
     }

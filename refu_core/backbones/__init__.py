@@ -1,5 +1,11 @@
 """Networks that predict a garment's displacement in the unposed space; `skinned` is the one without a network."""
 
+from refu_core.backbones._beyond import KINDS as KINDS
+from refu_core.backbones._beyond import Beyond as Beyond
+from refu_core.backbones._beyond import BeyondConfig as BeyondConfig
+from refu_core.backbones._beyond import WithBeyond as WithBeyond
+from refu_core.backbones._beyond import legs_share as legs_share
+from refu_core.backbones._beyond import lying_share as lying_share
 from refu_core.backbones._decoder import BasisDecoder as BasisDecoder
 from refu_core.backbones._decoder import Controls as Controls
 from refu_core.backbones._dynamics import Dynamic as Dynamic
@@ -13,10 +19,6 @@ from refu_core.backbones._features import upright as upright
 from refu_core.backbones._frequency import LaplacianSmoothing as LaplacianSmoothing
 from refu_core.backbones._gcnn import Gcnn as Gcnn
 from refu_core.backbones._gcnn import GcnnConfig as GcnnConfig
-from refu_core.backbones._lying import Lying as Lying
-from refu_core.backbones._lying import LyingConfig as LyingConfig
-from refu_core.backbones._lying import WithLying as WithLying
-from refu_core.backbones._lying import lying_share as lying_share
 from refu_core.backbones._mlp import Mlp as Mlp
 from refu_core.backbones._mlp import MlpConfig as MlpConfig
 from refu_core.backbones._perceptron import Perceptron as Perceptron
@@ -33,11 +35,11 @@ from refu_core.backbones._presets import load_basis as load_basis
 from refu_core.backbones._presets import require_basis as require_basis
 from refu_core.backbones._presets import save_backbone as save_backbone
 from refu_core.backbones._presets import save_basis as save_basis
+from refu_core.backbones._presets import save_beyond as save_beyond
 from refu_core.backbones._presets import save_dynamics as save_dynamics
-from refu_core.backbones._presets import save_lying as save_lying
 from refu_core.backbones._presets import uses_basis as uses_basis
+from refu_core.backbones._presets import with_beyond as with_beyond
 from refu_core.backbones._presets import with_dynamics as with_dynamics
-from refu_core.backbones._presets import with_lying as with_lying
 from refu_core.backbones._protocol import MAX_OFFSET as MAX_OFFSET
 from refu_core.backbones._protocol import Backbone as Backbone
 from refu_core.backbones._protocol import Skinned as Skinned

@@ -14,10 +14,10 @@ from torch.nn import Module
 
 from refu_core._files import read_json
 from refu_core._warp import memory
+from refu_core.backbones._beyond import KINDS, Beyond, BeyondConfig, WithBeyond
 from refu_core.backbones._decoder import BasisDecoder, Decoder, DenseDecoder
 from refu_core.backbones._dynamics import Dynamic, Dynamics, DynamicsConfig
 from refu_core.backbones._gcnn import Gcnn, GcnnConfig
-from refu_core.backbones._lying import Lying, LyingConfig, WithLying
 from refu_core.backbones._mlp import Mlp, MlpConfig
 from refu_core.backbones._protocol import MAX_OFFSET, Backbone, Skinned
 from refu_core.backbones._tailornet import TailorNet, TailorNetConfig
@@ -194,14 +194,14 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
 _BASIS = "basis."
 
 
-def save_lying(folder: Path, lying: Lying, card: Mapping[str, Any]) -> Path:
-    """Writes what lying does to a garment, `folder`/lying. Raises `WeightsError` also if there is no basis."""
-    basis = {_BASIS + k: v for k, v in lying.decoder.tensors().items()}
-    return _save_addition(folder / "lying", lying, card, basis)
+def save_beyond(folder: Path, beyond: Beyond, card: Mapping[str, Any]) -> Path:
+    """Writes what is added in postures of a kind, `folder`/<kind>. Raises `WeightsError` also if there is no basis."""
+    basis = {_BASIS + k: v for k, v in beyond.decoder.tensors().items()}
+    return _save_addition(folder / beyond.kind, beyond, card, basis)
 
 
 def _save_addition(
-    stem: Path, network: Dynamics | Lying, card: Mapping[str, Any], others: Mapping[str, Tensor]
+    stem: Path, network: Dynamics | Beyond, card: Mapping[str, Any], others: Mapping[str, Tensor]
 ) -> Path:
     """Writes what is added to a backbone, beside it; its card names the backbone's basis."""
     basis = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
@@ -217,24 +217,30 @@ def _own_tensors(network: Module, *, half: bool) -> dict[str, Tensor]:
     return {k: v.half() if half and k in parameters else v for k, v in state.items()}
 
 
-def with_lying(network: Backbone, weights: Weights) -> Backbone:
-    """A backbone made from `weights`, with what lying does to its garment, if that is beside those of a tailornet.
+def with_beyond(network: Backbone, weights: Weights) -> Backbone:
+    """A backbone made from `weights`, with the networks for further postures that are beside those of a tailornet.
 
-    Raises `WeightsError`: it is damaged, or made for another basis.
+    Raises `WeightsError`: one is damaged, or made for another basis.
     """
-    if weights.card.get("backbone") != "tailornet" or not weights.path.with_name("lying.json").exists():
+    kinds = [kind for kind in KINDS if weights.path.with_name(f"{kind}.json").exists()]
+    if weights.card.get("backbone") != "tailornet" or not kinds:
         return network
+    n = getattr(network, "decoder").n_vertices  # noqa: B009 - a trained one has it
+    device = next(network.parameters()).device if isinstance(network, Module) else "cpu"
+    beyond = [_load_beyond(kind, weights, n).float().to(device) for kind in kinds]
+    return WithBeyond(network, beyond).eval().requires_grad_(False)
+
+
+def _load_beyond(kind: str, weights: Weights, n_vertices: int) -> Beyond:
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
-    stored = load_weights(weights.path.with_name("lying"), expect=expect)
+    stored = load_weights(weights.path.with_name(kind), expect=expect)
     tensors = {k: v for k, v in stored.tensors.items() if not k.startswith(_BASIS)}
     with naming(stored.path):
-        config = config_of_card(LyingConfig, stored.card.get("config"))
+        config = config_of_card(BeyondConfig, stored.card.get("config"))
         decoder = BasisDecoder.of_tensors({k[len(_BASIS) :]: v for k, v in stored.tensors.items() if k not in tensors})
-        if decoder.n_vertices != (n := getattr(network, "decoder").n_vertices):  # noqa: B009 - a trained one has it
-            raise WeightsError(f"wanted {n} vertices, got {decoder.n_vertices}; train it again")
-        lying = build_for(tensors, lambda: Lying(config, decoder), shared="decoder.")
-    device = next(network.parameters()).device if isinstance(network, Module) else "cpu"
-    return WithLying(network, lying.float().to(device)).eval().requires_grad_(False)
+        if decoder.n_vertices != n_vertices:
+            raise WeightsError(f"wanted {n_vertices} vertices, got {decoder.n_vertices}; train it again")
+        return build_for(tensors, lambda: Beyond(kind, config, decoder), shared="decoder.")
 
 
 def load_backbone(
@@ -252,7 +258,7 @@ def load_backbone(
     if weights is None:
         return Skinned()
     network = backbone_from_weights(weights, template).requires_grad_(False)
-    return with_lying(with_dynamics(name, network, weights), weights)
+    return with_beyond(with_dynamics(name, network, weights), weights)
 
 
 def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:

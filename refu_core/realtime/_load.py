@@ -8,7 +8,7 @@ from os import PathLike
 
 import torch
 
-from refu_core.backbones import Skinned, backbone_weights, with_dynamics, with_lying
+from refu_core.backbones import Skinned, backbone_weights, with_beyond, with_dynamics
 from refu_core.body import ARMS, BodyFit, Collider, SmplBody, load_body, load_fit
 from refu_core.errors import BodyError, GarmentError, WeightsError, require_type
 from refu_core.garments import GarmentTemplate, load_garment, worn_on
@@ -111,7 +111,7 @@ def wearable_of(
             f"{hint}train some with `refu train {template.name} --body`"
         )
         raise WeightsError(msg)
-    network = with_lying(with_dynamics(backbone, network, stored), stored)
+    network = with_beyond(with_dynamics(backbone, network, stored), stored)
     margin = DEFAULT_MARGIN if refu is None else refu.margin
     feels_arms = all(joint in template.card.joints for arm in ARMS for joint in arm[:2])  # shoulders and elbows
     return Wearable(worn, network, refu, margin, betas, size, feels_arms and stored.card.get("knows_limbs") is True)

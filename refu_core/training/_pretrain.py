@@ -309,7 +309,7 @@ def take_inputs(model: nets.Network, train: data.TrainingSamples, garment: Garme
             net.standardise(inputs, groups[:n], is_bounded=bounded[:n])
 
 
-def code_loss(model: nets.TailorNet | nets.Mlp | nets.Lying) -> Callable[[Tensor, Tensor], Tensor]:
+def code_loss(model: nets.TailorNet | nets.Mlp | nets.Beyond) -> Callable[[Tensor, Tensor], Tensor]:
     """What tells the distance between the garments of two codes [mm].
 
     Dense codes are vertices: L1, as in the original. In an orthonormal basis, distances between codes give root mean

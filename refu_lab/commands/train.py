@@ -22,8 +22,9 @@ class TrainOptions:
     network: str = setting(
         "garment",
         "sdf: the paper's network for the body's distance (preset paper or small); dynamics: what moving cloth does "
-        "beyond the tailornet of --mode in --output, from sequences; lying: what lying people's cloth does beyond it",
-        choices=("garment", "sdf", "dynamics", "lying"),
+        "beyond the tailornet of --mode in --output, from sequences; lying, or legs (apart or drawn up): what cloth "
+        "does beyond it in such postures",
+        choices=("garment", "sdf", "dynamics", "lying", "legs"),
     )
     mode: str = setting(
         "hybrid",
@@ -104,7 +105,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
-    needed = {} if args.network == "lying" else {"motions": "rehearse", "rehearse": "start"}
+    needed = {} if args.network in ("lying", "legs") else {"motions": "rehearse", "rehearse": "start"}
     cli.require_use(args, {"fps": "motions", **needed, "joints": "start"})
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)

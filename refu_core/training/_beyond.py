@@ -1,4 +1,4 @@
-"""Training of what cloth does on lying people, on top of a backbone that isn't told of more than half of a tilt."""
+"""Training of what cloth does in postures that a backbone doesn't know, on top of it: lying, legs apart or drawn up."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from refu_core import backbones as nets
 from refu_core.body import SmplBody
-from refu_core.errors import RefuError
+from refu_core.errors import RefuError, printable
 from refu_core.garments import GarmentTemplate
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training import _data as data
@@ -21,8 +21,8 @@ from refu_core.training._rehearsal import Rehearsal
 
 
 @dataclass(frozen=True)
-class LyingSettings:
-    """How what lying does is trained."""
+class BeyondSettings:
+    """How a network for further postures is trained."""
 
     loop: LoopSettings = field(default_factory=LoopSettings)
     steps: int = 3000
@@ -32,85 +32,88 @@ class LyingSettings:
     """Share held out for validation, as whole style-shape pairs."""
 
 
-def train_lying(
+def train_beyond(
+    kind: str,
     garment: str | GarmentTemplate,
     dataset: str | Path | GarmentDataset | GarmentSequences,
     folder: str | Path,
     *,
     rehearsal: Rehearsal,
     mode: str = "hybrid",
-    settings: LyingSettings | None = None,
+    settings: BeyondSettings | None = None,
     body: SmplBody | None = None,
     device: str = "cpu",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Trains what lying adds to the garment's tailornet in `folder`, and writes `folder`/lying.
+    """Trains what is added to the garment's tailornet in `folder` in postures of a kind, and writes `folder`/<kind>.
 
-    Samples of people who don't lie are left out. If interrupted, the same call goes on from the last checkpoint.
+    Samples in other postures are left out. If interrupted, the same call goes on from the last checkpoint.
 
     Args:
+        kind: `lying`, or `legs` for thighs that are apart or drawn up.
         folder: holds tailornet-<mode> and its basis, which are left as they are.
-        rehearsal: bodies of the tailornet's plans. To those of them who bend or crawl nothing is added.
+        rehearsal: bodies of the tailornet's plans. To those of them who are in such a posture nothing is added.
         mode: mode of the tailornet; modes that share a basis share this, too.
         settings: the default ones if not given.
         garment, dataset, body, device, quiet: as in `pretrain`.
 
     Returns:
-        The card: what was trained on what, and its figures on test samples of lying people, beside the tailornet's.
+        The card: what was trained on what, and its figures on its test samples, beside the tailornet's.
 
     Raises:
-        RefuError: the set is of another garment or body, has too few lying people or none to test on, or a checkpoint
-            there is of another training.
+        RefuError: no such kind, the set is of another garment or body, has too few people in such postures or none to
+            test on, or a checkpoint there is of another training.
         WeightsError: no tailornet there, or a damaged one.
     """
-    opened = data.TrainingSet.of(garment, dataset, body, who=_lie)
+    if kind not in nets.KINDS:
+        raise RefuError(f"no kind of postures {printable(kind)}: wanted {' or '.join(nets.KINDS)}")
+
+    def who(pose: Tensor) -> Tensor:
+        return nets.KINDS[kind].share(pose) > 0
+
+    opened = data.TrainingSet.of(garment, dataset, body, who=who)
     template, body, folder = opened.garment, opened.body, Path(folder)
-    test = data.read_samples(opened.rows, body, template, split="test", who=_lie)
+    test = data.read_samples(opened.rows, body, template, split="test", who=who)
     samples = opened.samples
     if not len(samples) or not len(test):
-        msg = f"wanted lying people to learn from and to test on, the set of {template.name} has {len(samples)} and "
-        raise RefuError(f"{msg}{len(test)}: refu simulate --postures")
-    upright, card_of_upright = opened.tailornet(folder, mode)
-    settings = settings or LyingSettings()
+        msg = f"wanted people of the kind {kind} to learn from and to test on, the set of {template.name} has "
+        raise RefuError(f"{msg}{len(samples)} and {len(test)}: refu simulate --postures")
+    known, card_of_known = opened.tailornet(folder, mode)
+    settings = settings or BeyondSettings()
     torch_device = start_parallel(device)
     train, validation = data.split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     train = train.joined(data.mirrored(train, data.Mirror.of(template)))
-    owed = [one.displacement - data.displacements(upright, one) for one in (train, validation)]
+    owed = [one.displacement - data.displacements(known, one) for one in (train, validation)]
     # With both signs the mean is zero, so that nothing can be added.
     mean, components = data.principal_components(torch.cat((owed[0], -owed[0])), rank=settings.rank)
     decoder = nets.BasisDecoder(torch.zeros_like(mean), components)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
-        lying = nets.Lying(nets.LyingConfig(upright.config.joints), decoder)
-    rehearsed = rehearsal.of(card_of_upright, upright, known=opened.card["plan"])
-    rehearsed = rehearsed.take(_lie(rehearsed.pose))
+        beyond = nets.Beyond(kind, nets.BeyondConfig(known.config.joints), decoder)
+    rehearsed = rehearsal.of(card_of_known, known, known=opened.card["plan"])
+    rehearsed = rehearsed.take(who(rehearsed.pose))
     owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
     parts = [
-        (lying.seen(one.betas, one.pose, one.style), decoder.encode(added))
+        (beyond.seen(one.betas, one.pose, one.style), decoder.encode(added))
         for one, added in zip((train.joined(rehearsed), validation), owed, strict=True)
     ]
-    groups = torch.cat((torch.zeros(3, dtype=torch.long), 1 + lying.features.groups))
-    lying.net.standardise(parts[0][0], groups)
+    groups = torch.cat((torch.zeros(3, dtype=torch.long), 1 + beyond.features.groups))
+    beyond.net.standardise(parts[0][0][:, 1:], groups)
     described = {
         **opened.identity,
         "mode": mode,
-        "tailornet_sha256": card_of_upright["sha256"],
+        "tailornet_sha256": card_of_known["sha256"],
         "settings": asdict(settings),
         "samples": len(train),
         "rehearsed": len(rehearsed),
     }
-    loop = Loop(lying, settings.loop, folder / "lying", [described, asdict(lying.config)], torch_device, quiet=quiet)
-    loop.run(TrainingStage("lying", Objective([lying], lying, code_loss(lying)), settings.steps, *parts))
-    lying.to("cpu").eval()
-    both: dict[str, nets.Backbone] = {"mpve_mm": nets.WithLying(upright, lying), "upright_mm": upright}
+    loop = Loop(beyond, settings.loop, folder / kind, [described, asdict(beyond.config)], torch_device, quiet=quiet)
+    loop.run(TrainingStage(kind, Objective([beyond], beyond, code_loss(beyond)), settings.steps, *parts))
+    beyond.to("cpu").eval()
+    both: dict[str, nets.Backbone] = {"mpve_mm": nets.WithBeyond(known, [beyond]), "without_mm": known}
     figures = {name: data.mpve(data.displacements(one, test), test, body, template) for name, one in both.items()}
     card = {**described, "dataset": opened.card, "figures": {"samples": len(test), **figures}}
     if is_writer():
-        nets.save_lying(folder, lying, card)
+        nets.save_beyond(folder, beyond, card)
         loop.checkpoint.unlink(missing_ok=True)
     return card
-
-
-def _lie(pose: Tensor) -> Tensor:
-    """Which of some people (N, 24, 3) lie, or nearly, shape (N,)."""
-    return nets.lying_share(nets.up_in_root(pose)) > 0

@@ -1,0 +1,151 @@
+"""What cloth does in postures that a backbone doesn't know, on top of it: who lies, or has legs apart or drawn up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from refu_core.backbones._decoder import BasisDecoder
+from refu_core.backbones._features import MOST_TILT, N_STYLE_SHAPE, PoseFeatures, style_shape, up_in_root
+from refu_core.backbones._perceptron import Perceptron
+from refu_core.backbones._protocol import Backbone
+from refu_core.body import rotvec_to_rotmat
+
+TILTS = (MOST_TILT, 0.25)
+"""Cosines of the tilts of the pelvis between which a lying person's cloth is faded in: 60°, the most that other
+networks are told of (`told_up`), and 76°."""
+APART = (math.cos(math.radians(75)), math.cos(math.radians(90)))
+"""Cosines of the angles between the thighs between which cloth on legs apart is faded in."""
+DRAWN_UP = (math.cos(math.radians(95)), math.cos(math.radians(110)))
+"""The same for the angle by which a thigh is drawn up: in a chair it is 90°, in a squat 120°."""
+
+
+def _faded(cosine: Tensor, range_: tuple[float, float]) -> Tensor:
+    """0 to 1 as a cosine falls from one end of a range to the other, without a corner."""
+    first, full = range_
+    t = ((first - cosine) / (first - full)).clamp(0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def lying_share(pose: Tensor) -> Tensor:
+    """How much some people (B, 24, 3) [rad] lie, 0 to 1, shape (B,); a handstand isn't lying."""
+    return _faded(up_in_root(pose)[:, 1].abs(), TILTS)
+
+
+def legs_share(pose: Tensor) -> Tensor:
+    """How much some people (B, 24, 3) [rad] have their thighs apart or drawn up, 0 to 1, shape (B,).
+
+    None of it is left of somebody who lies.
+    """
+    thighs = rotvec_to_rotmat(pose[:, 1:3])[..., 1]  # where they point, turned round
+    apart, drawn = _faded((thighs[:, 0] * thighs[:, 1]).sum(1), APART), _faded(thighs[..., 1].amin(1), DRAWN_UP)
+    return (1 - (1 - apart) * (1 - drawn)) * (1 - lying_share(pose))
+
+
+def _along(rotvec: Sequence[float]) -> tuple[float, float, float]:
+    """Where a rotation vector [rad] turns the y axis."""
+    if not (angle := math.hypot(*rotvec)):
+        return 0.0, 1.0, 0.0
+    x, y, z = (one / angle for one in rotvec)
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return (1 - cosine) * x * y - sine * z, cosine + (1 - cosine) * y * y, (1 - cosine) * y * z + sine * x
+
+
+def _lies(pose: Sequence[Sequence[float]]) -> bool:
+    return abs(_along(pose[0])[1]) < TILTS[0]
+
+
+def _stretches_legs(pose: Sequence[Sequence[float]]) -> bool:
+    left, right = map(_along, pose[1:3])
+    between = sum(one * other for one, other in zip(left, right, strict=True))
+    return between < APART[0] or min(left[1], right[1]) < DRAWN_UP[0]
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Postures of one kind."""
+
+    share: Callable[[Tensor], Tensor]
+    """How much people (B, 24, 3) [rad] are in them, 0 to 1, shape (B,)."""
+    is_any: Callable[[Sequence[Sequence[float]]], bool]
+    """Whether that is above zero for one person, by the rotation vectors of pelvis and hips [rad], shape (3, 3).
+
+    In Python: torch takes a hundred times as long for one person.
+    """
+
+
+KINDS = {"lying": _Kind(lying_share, _lies), "legs": _Kind(legs_share, _stretches_legs)}
+"""Postures that a garment may have a network for, by that network's name."""
+
+
+@dataclass(frozen=True)
+class BeyondConfig:
+    """Sizes of the perceptron."""
+
+    joints: tuple[int, ...]
+    """Those that it sees, beside world up."""
+    hidden: tuple[int, ...] = (128, 128)
+    """Hidden layers: with one of them, a lying T-shirt is off by 17.1 mm, with two by 16.4, with three or wider ones by
+    16.3."""
+    activation: str = "silu"
+    dropout: float = 0.2
+
+
+class Beyond(nn.Module):
+    """(θ, β, γ) of somebody in a posture of one of the `KINDS` to what is added to a backbone's displacements.
+
+    Zero for everybody else.
+    """
+
+    def __init__(self, kind: str, config: BeyondConfig, decoder: BasisDecoder) -> None:
+        """`decoder` holds what may be added; its mean is zero, so that there may be nothing to add."""
+        super().__init__()
+        self.kind, self.config, self.decoder = kind, config, decoder
+        self.features = PoseFeatures(config.joints, "matrix")
+        n = 3 + self.features.size + N_STYLE_SHAPE
+        self.net = Perceptron(n, config.hidden, decoder.size, activation=config.activation, dropout=config.dropout)
+
+    def seen(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
+        """The share, then what the perceptron sees, shape (B, 1 + I): world up as it is, pose features, β and γ."""
+        share = KINDS[self.kind].share(pose)[:, None]
+        return torch.cat((share, up_in_root(pose), self.features(pose), style_shape(betas, style)), 1)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """Code of what is added, shape (B, R), from what is `seen` (B, 1 + I)."""
+        return seen[:, :1] * self.net(seen[:, 1:])
+
+
+class WithBeyond(nn.Module):
+    """A backbone with networks for postures `beyond` what it knows, which cost nothing for everybody else."""
+
+    def __init__(self, known: Backbone, beyond: Iterable[Beyond]) -> None:
+        super().__init__()
+        self.known, self.beyond = known, nn.ModuleList(beyond)
+        self._is_serial = next(self.beyond.parameters()).device.type == "cpu"
+        self.heeds_past = known.heeds_past
+
+    @property
+    def decoder(self) -> nn.Module:
+        """That of the backbone."""
+        decoder: nn.Module = self.known.decoder  # type: ignore[attr-defined]
+        return decoder
+
+    def wearer_code(self, betas: Tensor, style: Tensor | None) -> Tensor | None:
+        """That of the backbone."""
+        return self.known.wearer_code(betas, style)
+
+    def forward(self, betas: Tensor, pose: Tensor, style: Tensor | None, **told: Any) -> Tensor:
+        """Predicts as the backbone does, which is given what it is `told`, and adds what cloth does beyond."""
+        displacement = self.known(betas, pose, style, **told)
+        assert displacement is not None  # there are weights
+        people = pose[:, :3].tolist() if self._is_serial else []
+        for one in self.beyond:
+            assert isinstance(one, Beyond)
+            if not self._is_serial or any(map(KINDS[one.kind].is_any, people)):
+                displacement = displacement + one.decoder(one(one.seen(betas, pose, style)))
+        return displacement

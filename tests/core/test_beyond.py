@@ -1,0 +1,195 @@
+"""Cloth on people who lie, or whose legs are apart: what is added there, and that nobody else notices."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from small_set import write_set
+from torch import Tensor
+
+from refu_core import RefuError, load_body, load_garment
+from refu_core.backbones import (
+    KINDS,
+    BasisDecoder,
+    Beyond,
+    BeyondConfig,
+    WithBeyond,
+    legs_share,
+    load_backbone,
+    lying_share,
+    save_beyond,
+    up_in_root,
+)
+from refu_core.errors import WeightsError
+from refu_core.simulation import SamplePlan
+from refu_core.training import BeyondSettings, LoopSettings, PretrainSettings, Rehearsal, pretrain, train_beyond
+from refu_core.weights import load_weights
+
+pytestmark = pytest.mark.usefixtures("no_curves_in_module")
+GARMENT = "tshirt-male"
+OWN = "short-pant-male"
+
+
+def tilted(degrees: float, *, about: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> Tensor:
+    """A straight person whose pelvis is tilted, shape (1, 24, 3)."""
+    pose = torch.zeros(1, 24, 3)
+    pose[0, 0] = np.radians(degrees) * torch.tensor(about)
+    return pose
+
+
+def with_legs(left: tuple[float, float, float], right: tuple[float, float, float]) -> Tensor:
+    """Somebody upright whose hips are turned so [degrees], shape (1, 24, 3)."""
+    pose = torch.zeros(1, 24, 3)
+    pose[0, 1:3] = torch.deg2rad(torch.tensor((left, right)))
+    return pose
+
+
+@given(st.floats(0, 179.5))
+def test_it_is_faded_in_without_a_step(degrees: float) -> None:
+    here, there = float(lying_share(tilted(degrees))), float(lying_share(tilted(degrees + 0.5)))
+    assert abs(here - there) < 0.06
+    assert here == (0 if degrees <= 60 or degrees >= 120 else here)
+    assert here == (1 if 76 < degrees < 104 else here)
+
+
+@given(st.lists(st.lists(st.floats(-4, 4), min_size=3, max_size=3), min_size=3, max_size=3), st.sampled_from([*KINDS]))
+def test_who_is_in_a_posture_is_whose_share_is_above_zero(turns: list[list[float]], kind: str) -> None:
+    pose = torch.zeros(1, 24, 3, dtype=torch.float64)
+    pose[0, :3] = torch.tensor(turns)
+    share = float(KINDS[kind].share(pose))
+    if kind == "legs" and KINDS["lying"].is_any(turns):
+        assert share < 1  # faded out towards who lies, down to zero
+        assume(lying_share(pose) < 1)
+    if not 0 < share < 1e-9:  # at the brink, rounding decides
+        assert KINDS[kind].is_any(turns) == (share > 0)
+
+
+@given(st.floats(0, 160), st.sampled_from([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)]))
+def test_legs_are_faded_in_without_a_step(degrees: float, axis: tuple[float, float, float]) -> None:
+    here, there = (
+        float(legs_share(with_legs((a * axis[0], a * axis[1], a * axis[2]), (0, 0, 0))))
+        for a in (degrees, degrees + 0.5)
+    )
+    assert abs(here - there) < 0.06
+    assert here == (0 if degrees <= 75 else here)
+    assert here == (1 if degrees >= 90.1 else here)
+
+
+@pytest.mark.parametrize(("both_hips", "share"), [(-85, 0), (-94, 0), (-111, 1), (-130, 1)])
+def test_sitting_is_known_and_squatting_is_not(both_hips: float, share: float) -> None:
+    assert float(legs_share(with_legs((both_hips, 0, 0), (both_hips, 0, 0)))) == share
+
+
+def test_who_lies_with_legs_apart_lies() -> None:
+    pose = with_legs((0, 0, 60), (0, 0, -60))
+    assert float(legs_share(pose)) == 1
+    pose[0, 0] = tilted(90)[0, 0]
+    assert float(legs_share(pose)) == 0
+    assert float(lying_share(pose)) == 1
+
+
+@pytest.mark.parametrize("degrees", [0, 45, 59.9, 125, 180])
+def test_who_does_not_lie_wears_what_the_backbone_says(degrees: float) -> None:
+    both = load_backbone("tailornet", GARMENT, mode="hybrid")
+    assert isinstance(both, WithBeyond)
+    given = torch.zeros(1, 10), tilted(degrees), None
+    assert torch.equal(both(*given), both.known(*given))
+
+
+def test_who_lies_wears_something_else_beside_who_stands() -> None:
+    both = load_backbone("tailornet", GARMENT, mode="hybrid")
+    assert isinstance(both, WithBeyond)
+    betas, pose = torch.zeros(3, 10), torch.cat((tilted(10), tilted(90), tilted(-90)))
+    added = (both(betas, pose, None) - both.known(betas, pose, None)).norm(dim=-1)
+    assert float(added[0].max()) == 0
+    assert float(added[1:].mean(1).min()) > 0.002
+    alone = torch.cat([both(betas[:1], one[None], None) for one in pose])
+    torch.testing.assert_close(alone, both(betas, pose, None), rtol=0, atol=1e-5)
+
+
+def on_a_bed(pose: Tensor) -> Tensor:
+    """Shorts that slide down, as far as they lie on front or back."""
+    n = load_garment(OWN).n_vertices
+    return 0.05 * up_in_root(pose)[:, 2:, None] * torch.tensor([1.0, 0.0, 0.0]).expand(len(pose), n, 3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of shorts, learnt from people who stand, and a set of people who lie."""
+    folder, garment = tmp_path_factory.mktemp("lying"), load_garment(OWN)
+    body = load_body(garment.body)
+    write_set(folder / "standing", garment, body, pairs=12, poses=5, displacement=on_a_bed)
+    card = json.loads((folder / "standing" / "card.json").read_text())
+    plan = asdict(SamplePlan(OWN, 60, pivots=4, recorded_share=0.0))
+    (folder / "standing" / "card.json").write_text(json.dumps(card | {"plan": plan}))
+    write_set(
+        folder / "lying", garment, body, pairs=60, poses=4, test_pairs=8, spread=0.8, turn=1.3, displacement=on_a_bed
+    )
+    loop = LoopSettings(batch_size=16, check_every=20)
+    few = PretrainSettings(loop, rank=4, style_shape_steps=2, low_steps=2, steps=2)
+    pretrain(OWN, folder / "standing", folder / "weights", settings=few, quiet=True)
+    return folder
+
+
+def test_it_learns_what_a_backbone_cannot_know_and_comes_back_from_its_file(folder: Path) -> None:
+    settings = BeyondSettings(LoopSettings(batch_size=32, learning_rate=3e-3), steps=500)
+    how: dict[str, Any] = {"mode": "none", "rehearsal": Rehearsal(30), "settings": settings}
+    card = train_beyond("lying", OWN, folder / "lying", folder / "weights", **how)
+    assert card["figures"]["mpve_mm"] < 0.8 * card["figures"]["without_mm"]
+    both = load_backbone("tailornet", OWN, mode="none", folder=folder / "weights")
+    assert isinstance(both, WithBeyond)
+    pose = torch.cat((tilted(0), tilted(90)))
+    off = (both(torch.zeros(2, 10), pose, None) - both.known(torch.zeros(2, 10), pose, None)).norm(dim=-1).mean(1)
+    assert off[0] == 0
+    assert float(off[1]) > 0.005
+    again = train_beyond("lying", OWN, folder / "lying", folder / "weights", **how)
+    assert again["figures"] == card["figures"]
+
+
+def test_nobody_lies_in_a_set_of_people_who_stand(folder: Path) -> None:
+    with pytest.raises(RefuError, match=r"of the kind lying to learn from and to test on, the set of .* has 0 and 0"):
+        train_beyond("lying", OWN, folder / "standing", folder / "weights", mode="none", rehearsal=Rehearsal(30))
+
+
+def test_what_does_not_belong_together_is_refused(folder: Path, tmp_path: Path) -> None:
+    for file in (folder / "weights").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    card = {"garment": OWN, "body_fingerprint": load_body("male").fingerprint}
+    components = torch.linalg.qr(torch.randn(30, 2)).Q.T
+    save_beyond(tmp_path, Beyond("lying", BeyondConfig((0, 1)), BasisDecoder(torch.zeros(10, 3), components)), card)
+    with pytest.raises(WeightsError, match=r"lying.* got 10; train it again"):
+        load_backbone("tailornet", OWN, mode="none", folder=tmp_path)
+    other = (tmp_path / "lying.json").read_text()
+    (tmp_path / "lying.json").write_text(other.replace(load_weights(tmp_path / "basis").card["sha256"], "0" * 64))
+    with pytest.raises(WeightsError, match="basis_sha256"):
+        load_backbone("tailornet", OWN, mode="none", folder=tmp_path)
+
+
+def test_kinds_of_postures_have_networks_of_their_own(folder: Path, tmp_path: Path) -> None:
+    for file in (folder / "weights").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    garment, pose = load_garment(OWN), torch.cat((tilted(0), tilted(90), with_legs((-120, 0, 0), (-120, 0, 0))))
+    card = {"garment": OWN, "body_fingerprint": load_body("male").fingerprint}
+    components = torch.linalg.qr(torch.randn(3 * garment.n_vertices, 2)).Q.T
+    given = torch.zeros(3, 10), pose, None
+    known = load_backbone("tailornet", OWN, mode="none", folder=tmp_path)(*given)
+    changed = []
+    for kind in KINDS:
+        decoder = BasisDecoder(torch.zeros(garment.n_vertices, 3), components)
+        save_beyond(tmp_path, Beyond(kind, BeyondConfig((0, 1, 2)), decoder), card)
+        both = load_backbone("tailornet", OWN, mode="none", folder=tmp_path)
+        changed.append(((both(*given) - known).abs().amax((1, 2)) > 0).tolist())
+    assert changed == [[False, True, False], [False, True, True]]
+
+
+def test_no_such_kind(folder: Path) -> None:
+    with pytest.raises(RefuError, match="no kind of postures sitting: wanted lying or legs"):
+        train_beyond("sitting", OWN, folder / "lying", folder / "weights", rehearsal=Rehearsal(1))
