@@ -20,10 +20,10 @@ TILTS = (MOST_TILT, 0.25)
 """Cosines of the tilts of the pelvis between which a lying person's cloth is faded in: 60°, the most that other
 networks are told of (`told_up`), and 76°."""
 SIDEWAYS = (0.8, 1.15)
-"""How far the directions of the thighs are apart sideways where cloth is faded in: 47° and 70°; recorded people's are 33°
-apart at most. From the latter on, a skirt is off by 20 to 120 mm without."""
+"""How far the thighs point apart sideways where cloth is faded in: 47° and 70°; those of recorded people do by 33°
+at most. From the latter on, a skirt is off by 20 to 120 mm without."""
 APART = (math.cos(math.radians(85)), math.cos(math.radians(110)))
-"""Cosines of the angles between the thighs; recorded people's are 78° at most."""
+"""Cosines of the angles between the thighs; recorded ones are at 78° at most."""
 DRAWN_UP = (math.cos(math.radians(100)), math.cos(math.radians(120)))
 """Cosines of the angle by which a thigh is drawn up: in a chair it is 90°, in a squat 120°."""
 
