@@ -26,7 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
 from refu_core import GarmentPipeline, SmplFrame
-from refu_core.backbones import WithLying
+from refu_core.backbones import WithBeyond
 from refu_core.errors import MeshError
 from refu_core.realtime import GarmentStats, SkinShift, Wearer
 from refu_core.realtime._frame import FrameStep, packed_by
@@ -122,7 +122,7 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
     """The pipeline's step, with the launches that a GPU gets, and a tree that isn't built anew."""
     contact, collider = pipeline._steps[0].contact, pipeline.outfit.collider
     for one in pipeline.outfit.wearables.values():
-        if isinstance(one.backbone, WithLying):
+        if isinstance(one.backbone, WithBeyond):
             one.backbone._is_serial = False
     if collider is not None:
         collider._is_serial = collider.anatomy.aside._is_serial = False
