@@ -77,7 +77,7 @@ def test_legs_are_faded_in_without_a_step(degrees: float, axis: tuple[float, flo
     x, y, z = axis
     here, there = (float(legs_share(with_legs((x * a, y * a, z * a), (0, 0, 0)))) for a in (degrees, degrees + 0.5))
     assert abs(here - there) < 0.06
-    assert here == (0 if degrees <= 50 else here)
+    assert here == (0 if degrees <= 36 else here)
     assert here == (1 if z == 0 and degrees >= 110.1 else here)
 
 
