@@ -2,7 +2,7 @@
 """Draws the documentation's pictures into docs/images.
 
 python scripts/make_pictures.py replay                       # some minutes on one core
-python scripts/make_pictures.py collider | ros | wardrobe
+python scripts/make_pictures.py collider | postures | legs | ros | wardrobe
 python scripts/make_pictures.py dataset data/tshirt-male     # dataset-<garment>.png: random samples
 python scripts/make_pictures.py carried data/dress-female    # test samples: skinned, predicted, simulated
 """
@@ -10,9 +10,11 @@ python scripts/make_pictures.py carried data/dress-female    # test samples: ski
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -165,6 +167,22 @@ def draw_postures() -> None:
     save_jpeg(np.concatenate(rows), "postures")
 
 
+def draw_legs() -> None:
+    """A skirt, without (above) and with the network that it has for legs apart or drawn up."""
+    worn, size, columns = ("tshirt-female", "skirt-female"), (230, 230), []
+    with TemporaryDirectory() as folder:
+        for name in worn:
+            shipped = ROOT / "refu_core" / "weights" / name
+            shutil.copytree(shipped, Path(folder) / name, ignore=shutil.ignore_patterns("legs.*"))
+        pipelines = [GarmentPipeline.load(worn, weights=folder), GarmentPipeline.load(worn)]
+        for what in ("squat", "cross-legged", "straddle", "deep lunge", "side lunge", "high kick"):
+            outputs = [pipeline(SmplFrame(pose=posture(what))) for pipeline in pipelines]
+            camera = Viewpoint.framing(outputs[1][worn[1]].local, size=size, yaw=25.0, pitch=8.0, margin=1.5)
+            scenes = [dressed(*pair) for pair in zip(pipelines, outputs, strict=True)]
+            columns.append(np.concatenate([render(one, camera=camera, size=size, samples=9) for one in scenes]))
+    save_jpeg(np.concatenate(columns, axis=1), "legs")
+
+
 def draw_ros() -> None:
     """Three persons of `smpl_publisher`, as a viewer shows them."""
     pipeline, walk, size = GarmentPipeline.load(DEFAULT_GARMENTS), recorded("walk"), (900, 480)
@@ -230,6 +248,7 @@ OF_SHIPPED = {
     "replay": draw_replay,
     "collider": draw_collider,
     "postures": draw_postures,
+    "legs": draw_legs,
     "ros": draw_ros,
     "wardrobe": draw_wardrobe,
 }
