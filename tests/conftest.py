@@ -31,6 +31,9 @@ if importlib.util.find_spec("torch"):  # the adapters' tests run without it
 
     torch.set_num_threads(1)  # as the node runs; and the figures of two test runs agree to the bit
 
+# What earlier tests left belongs to threads that a forked process hasn't got: destroyed there, it crashes.
+os.register_at_fork(after_in_child=gc.freeze)
+
 
 LONGEST = (
     "lab/test_replay.py",

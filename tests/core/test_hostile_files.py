@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
+import os
 import pickle
 import pickletools
 import struct
@@ -388,6 +390,26 @@ MESHES = {
     "lids.obj": (lid(1000) + ("f " + " ".join(map(str, range(1, 1001))) + "\n") * 200).encode(),
     "solids.stl": FACET * 8000,
 }
+
+
+class Left:
+    """Garbage of another test, which must not be destroyed in another process."""
+
+    def __init__(self) -> None:
+        self.process, self.cycle = os.getpid(), self
+
+    def __del__(self) -> None:
+        if os.getpid() != self.process:
+            os.abort()
+
+
+def test_what_other_tests_left_is_not_destroyed_where_a_reader_runs() -> None:
+    gc.disable()
+    try:
+        Left()
+        assert not run_limited(gc.collect).error
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize("name", MESHES)
