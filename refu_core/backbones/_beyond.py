@@ -67,7 +67,9 @@ def _lies(pose: Sequence[Sequence[float]]) -> bool:
 
 
 def _stretches_legs(pose: Sequence[Sequence[float]]) -> bool:
-    left, right = map(_along, pose[1:3])
+    up, left, right = map(_along, pose[:3])
+    if abs(up[1]) <= TILTS[1]:  # lies
+        return False
     between = sum(one * other for one, other in zip(left, right, strict=True))
     return right[0] - left[0] > SIDEWAYS[0] or between < APART[0] or min(left[1], right[1]) < DRAWN_UP[0]
 
@@ -120,6 +122,11 @@ class Beyond(nn.Module):
         """The share, then what the perceptron sees, shape (B, 1 + I): world up as it is, pose features, β and γ."""
         share = KINDS[self.kind].share(pose)[:, None]
         return torch.cat((share, up_in_root(pose), self.features(pose), style_shape(betas, style)), 1)
+
+    def standardise(self, seen: Tensor) -> None:
+        """Takes the range and scale of the perceptron's inputs from what is `seen` of the training set (N, 1 + I)."""
+        groups = torch.cat((torch.zeros(3, dtype=torch.long), 1 + self.features.groups))
+        self.net.standardise(seen[:, 1:], groups)
 
     def forward(self, seen: Tensor) -> Tensor:
         """Code of what is added, shape (B, R), from what is `seen` (B, 1 + I)."""

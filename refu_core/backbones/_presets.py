@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -177,10 +177,7 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
         return network
     if not isinstance(network, TailorNet):
         raise WeightsError(f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}")
-    expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
-    stored = load_weights(weights.path.with_name("dynamics"), expect=expect)
-    with naming(stored.path):
-        config = config_of_card(DynamicsConfig, stored.card.get("config"))
+    stored, config = _load_addition(weights, "dynamics", DynamicsConfig)
     if not set(config.joints) <= {0, *network.config.joints}:
         msg = f"{stored.path}: wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got "
         msg += f"{config.joints}; train it again"
@@ -192,6 +189,7 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
 
 
 _BASIS = "basis."
+_Config = TypeVar("_Config", DynamicsConfig, BeyondConfig)
 
 
 def save_beyond(folder: Path, beyond: Beyond, card: Mapping[str, Any]) -> Path:
@@ -207,6 +205,14 @@ def _save_addition(
     basis = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
     described = {"config": asdict(network.config), "basis_sha256": str(basis.card["sha256"])}
     return save_weights(stem, {**_own_tensors(network, half=True), **others}, {**described, **card})
+
+
+def _load_addition(weights: Weights, name: str, kind: type[_Config]) -> tuple[Weights, _Config]:
+    """What `_save_addition` wrote as `name` beside a tailornet's `weights`, and its configuration."""
+    expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
+    stored = load_weights(weights.path.with_name(name), expect=expect)
+    with naming(stored.path):
+        return stored, config_of_card(kind, stored.card.get("config"))
 
 
 def _own_tensors(network: Module, *, half: bool) -> dict[str, Tensor]:
@@ -232,11 +238,9 @@ def with_beyond(network: Backbone, weights: Weights) -> Backbone:
 
 
 def _load_beyond(kind: str, weights: Weights, n_vertices: int) -> Beyond:
-    expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
-    stored = load_weights(weights.path.with_name(kind), expect=expect)
+    stored, config = _load_addition(weights, kind, BeyondConfig)
     tensors = {k: v for k, v in stored.tensors.items() if not k.startswith(_BASIS)}
     with naming(stored.path):
-        config = config_of_card(BeyondConfig, stored.card.get("config"))
         decoder = BasisDecoder.of_tensors({k[len(_BASIS) :]: v for k, v in stored.tensors.items() if k not in tensors})
         if decoder.n_vertices != n_vertices:
             raise WeightsError(f"wanted {n_vertices} vertices, got {decoder.n_vertices}; train it again")

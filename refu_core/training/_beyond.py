@@ -97,8 +97,7 @@ def train_beyond(
         (beyond.seen(one.betas, one.pose, one.style), decoder.encode(added))
         for one, added in zip((train.joined(rehearsed), validation), owed, strict=True)
     ]
-    groups = torch.cat((torch.zeros(3, dtype=torch.long), 1 + beyond.features.groups))
-    beyond.net.standardise(parts[0][0][:, 1:], groups)
+    beyond.standardise(parts[0][0])
     described = {
         **opened.identity,
         "mode": mode,

@@ -12,6 +12,8 @@ from refu_core.options import setting
 from refu_core.recordings import Axes
 from refu_lab.commands import _common as cli
 
+BEYOND = ("lying", "legs")
+"""`refu_core.backbones.KINDS`, named without importing torch."""
 TRAIN_MODES = ("none", "hybrid", "approx", "accurate", "collision-approx", "collision-accurate")
 
 
@@ -24,7 +26,7 @@ class TrainOptions:
         "sdf: the paper's network for the body's distance (preset paper or small); dynamics: what moving cloth does "
         "beyond the tailornet of --mode in --output, from sequences; lying, or legs (apart or drawn up): what cloth "
         "does beyond it in such postures",
-        choices=("garment", "sdf", "dynamics", "lying", "legs"),
+        choices=("garment", "sdf", "dynamics", *BEYOND),
     )
     mode: str = setting(
         "hybrid",
@@ -105,7 +107,7 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
-    needed = {} if args.network in ("lying", "legs") else {"motions": "rehearse", "rehearse": "start"}
+    needed = {} if args.network in BEYOND else {"motions": "rehearse", "rehearse": "start"}
     cli.require_use(args, {"fps": "motions", **needed, "joints": "start"})
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
