@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import signal
 from collections import defaultdict
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,16 +94,32 @@ def test_two_publishers_and_leaps_are_reported(scene: Peer) -> None:
     scene.spin_until(lambda: "publishers on" not in said(), "it is gone")
 
 
+def _stalled(scene: Peer, folder: Path, stack: ExitStack) -> NodeProcess:
+    """A subscriber that got garments and stands still.
+
+    Where one takes the place of another one that was killed, Fast DDS leaves about one in a hundred without any data
+    (its issues 2811 and 5469). That one stays, so that the next one has a place of its own.
+    """
+    for attempt in range(5):
+        process = stack.enter_context(NodeProcess(folder / f"{attempt}.txt", first=LISTENS))
+
+        def reads(one: NodeProcess = process) -> bool:
+            scene.send(frame(len(scene.garments)))
+            return "got one" in one.log
+
+        with suppress(AssertionError):
+            scene.spin_until(reads, "the second subscriber got one", timeout=30)
+            process.process.send_signal(signal.SIGSTOP)
+            return process
+    pytest.fail("none of five subscribers got anything")
+
+
 def test_a_subscriber_that_does_not_read_holds_nobody_up(scene: Peer, tmp_path: Path) -> None:
     for turn in range(3):  # without room in shared memory, one turn in eight went wrong
-        with NodeProcess(tmp_path / f"{turn}.txt", first=LISTENS) as stalled:
-
-            def reads(log: Path = tmp_path / f"{turn}.txt") -> bool:
-                scene.send(frame(len(scene.garments)))
-                return "got one" in log.read_text()
-
-            scene.spin_until(reads, "the second subscriber got one")
-            stalled.process.send_signal(signal.SIGSTOP)
+        folder = tmp_path / str(turn)
+        folder.mkdir()
+        with ExitStack() as stack:
+            stalled = _stalled(scene, folder, stack)
             scene.garments.clear()
             for i in range(40):  # eight times what the publisher keeps for who is slow
                 marker = scene.dress(frame(i, stamp_ns=(20_000 + turn) * 10**9 + i))
