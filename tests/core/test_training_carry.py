@@ -12,13 +12,13 @@ from small_set import write_set
 from torch import Tensor
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
-from refu_core.backbones import Controls, load_backbone
+from refu_core.backbones import Controls, PoseFeatures, load_backbone
 from refu_core.errors import WeightsError
 from refu_core.garments import BUILTIN_GARMENTS, save_garment
 from refu_core.modes import SdfMode
 from refu_core.simulation import open_dataset
 from refu_core.training import CarrySettings, carry_over
-from refu_core.training._carry import Carried, _borne_out
+from refu_core.training._carry import Carried, _borne_out, _Remainder
 from refu_core.training._data import displacements, posed_errors, read_samples
 from refu_core.weights import load_card, weights_folder
 
@@ -108,7 +108,7 @@ def test_only_what_the_samples_bear_out_is_carried_over() -> None:
 
 
 def test_what_the_samples_say_is_learnt(data: Path, made: Path) -> None:
-    """The least squares of its own code, on poses that it wasn't shown: nearer to them than what was carried over."""
+    """On poses that the net wasn't shown it is nearer to the simulation than what was carried over."""
     garment, body = load_garment(GARMENT), load_body("neutral")
     test = read_samples(open_dataset(data), body, garment, split="test")
 
@@ -119,6 +119,32 @@ def test_what_the_samples_say_is_learnt(data: Path, made: Path) -> None:
     before = error(carried(LIKE, GARMENT)(test.betas, test.pose))
     assert learnt < 0.8 * before
     assert load_card(made / GARMENT / "tailornet-none")["simulated"] == 24
+
+
+def test_between_samples_is_what_a_gaussian_process_says(data: Path) -> None:
+    """Against the formula, number by number: at a sample what it says, far from all of them their mean."""
+    garment = load_garment(GARMENT)
+    samples = read_samples(open_dataset(data), load_body("neutral"), garment, split="train")
+    features, settings = PoseFeatures(garment.card.joints, "matrix"), CarrySettings()
+    left = torch.randn(len(samples), 2, generator=torch.Generator().manual_seed(0))
+    found = _Remainder(features, samples, left, settings)
+
+    def inputs(betas: Tensor, pose: Tensor) -> np.ndarray:
+        return np.concatenate((features(pose).numpy(), settings.shape_scale * betas.numpy()), 1).astype(np.float64)
+
+    def kernel(a: np.ndarray, b: np.ndarray) -> float:
+        distance = np.sqrt(3) * np.sqrt(((a - b) ** 2).sum()) / settings.length
+        return (1 + distance) * np.exp(-distance)
+
+    known, asked = inputs(samples.betas, samples.pose), (samples.betas[:5] + 0.5, samples.pose[:5] * 0.7)
+    gram = np.array([[kernel(a, b) for b in known] for a in known]) + settings.ridge * np.eye(len(known))
+    mean = left.numpy().mean(0)
+    weights = np.linalg.inv(gram) @ (left.numpy() - mean)
+    wanted = np.array([[kernel(a, b) for b in known] for a in inputs(*asked)]) @ weights + mean
+    np.testing.assert_allclose(found(*asked).numpy(), wanted, atol=1e-5)
+    there = _Remainder(features, samples, left, replace(settings, ridge=1e-9))(samples.betas, samples.pose)
+    np.testing.assert_allclose(there.numpy(), left.numpy(), atol=1e-3)
+    np.testing.assert_allclose(found(samples.betas + 1e4, samples.pose).numpy(), [mean] * len(samples), atol=1e-6)
 
 
 def test_every_mode_loads(made: Path) -> None:
