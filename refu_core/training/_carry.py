@@ -176,12 +176,11 @@ def carry_over(
     left = data.in_chunks(encode, samples.displacement, size=256) - data.in_chunks(encode, share * here, size=256)
     remainder = _Remainder(model.features, samples, left, settings)
 
-    def taught(betas: Tensor, pose: Tensor) -> Bodies:
-        there = data.in_chunks(lambda *body: encode(share * carried(*body)), betas, pose, size=256)
-        return betas, pose, there + remainder(betas, pose)
+    def code(betas: Tensor, pose: Tensor) -> Tensor:
+        return encode(share * carried(betas, pose)) + remainder(betas, pose)
 
-    known = samples.betas, samples.pose
-    stage = _of_bodies(model, template, taught(*drawn), taught(*known), settings.steps)
+    taught = [(*body, data.in_chunks(code, *body, size=256)) for body in (drawn, (samples.betas, samples.pose))]
+    stage = _of_bodies(model, template, settings.steps, *taught)
     identity = [described, asdict(settings)]
     loop = Loop(model, settings.loop, output / "carried", identity, torch.device("cpu"), quiet=quiet)
     loop.run(stage)
@@ -280,7 +279,7 @@ Bodies = tuple[Tensor, Tensor, Tensor]
 
 
 def _of_bodies(
-    model: nets.TailorNet, garment: GarmentTemplate, drawn: Bodies, samples: Bodies, steps: int
+    model: nets.TailorNet, garment: GarmentTemplate, steps: int, drawn: Bodies, samples: Bodies
 ) -> TrainingStage:
     """Teaches the low-frequency net the codes of drawn bodies and of samples; a twelfth of the drawn are validation."""
     parts = []
