@@ -173,13 +173,14 @@ def carry_over(
         for parameter in (*model.style_shape.parameters(), *model.high.parameters()):
             parameter.zero_()
     encode = model.decoder.encode
-    left = data.in_chunks(encode, samples.displacement, size=256) - data.in_chunks(encode, share * here, size=256)
+    known, of_known = (samples.betas, samples.pose), data.in_chunks(encode, share * here, size=256)
+    left = data.in_chunks(encode, samples.displacement, size=256) - of_known
     remainder = _Remainder(model.features, samples, left, settings)
 
     def code(betas: Tensor, pose: Tensor) -> Tensor:
         return encode(share * carried(betas, pose)) + remainder(betas, pose)
 
-    taught = [(*body, data.in_chunks(code, *body, size=256)) for body in (drawn, (samples.betas, samples.pose))]
+    taught = (*drawn, data.in_chunks(code, *drawn, size=256)), (*known, of_known + remainder(*known))
     stage = _of_bodies(model, template, settings.steps, *taught)
     identity = [described, asdict(settings)]
     loop = Loop(model, settings.loop, output / "carried", identity, torch.device("cpu"), quiet=quiet)
