@@ -22,12 +22,13 @@ from tqdm import tqdm
 
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import SmplBody, apply_transforms, blend_transforms
-from refu_core.fitting import UNITS, Placing, SurfaceMesh, _place, _surround, _ways, standing_pose
-from refu_core.fitting._place import Place, find_places
+from refu_core.fitting import UNITS, Placing, SurfaceMesh, _found, _place, _surround, _ways, standing_pose
+from refu_core.fitting._found import Place
+from refu_core.fitting._place import find_places
 from refu_core.garments import BUILTIN_GARMENTS
 
 F64 = NDArray[np.float64]
-MODULES = (_place, _surround, _ways)
+MODULES = (_found, _place, _surround, _ways)
 """Where the numbers are; some are known to several of them."""
 SCALES = (1.0, 1.0, 0.93, 1.07)
 """How tall the wearer is, as shares of the body's height."""

@@ -12,9 +12,10 @@ import torch
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
 from refu_core.errors import GarmentError, require_type
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
+from refu_core.fitting._found import Place
 from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.fitting._pieces import apart, outer_sides, slivers, unsewn, without_bodies, without_floor, without_specks
-from refu_core.fitting._place import Place, find_places
+from refu_core.fitting._place import find_places
 from refu_core.fitting._placing import UNITS, Placing
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._transfer import Transfer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,11 +15,23 @@ from scipy.optimize import minimize
 from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import no_opening
+from refu_core.fitting._found import TOLERANCE, Place, told
 from refu_core.fitting._mesh_file import F64, SurfaceMesh
 from refu_core.fitting._placing import UNITS, Placing
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
-from refu_core.fitting._surround import NEAR, Fit, Samples, fits_of, lies_over, parts_legs, sample
-from refu_core.fitting._ways import HIGHEST, LIFTS, LYING, heights, is_sideways_turn, shifts, turns_of
+from refu_core.fitting._surround import NEAR, Samples, fits_of, lies_over, opens_behind, parts_legs, sample
+from refu_core.fitting._ways import (
+    HIGHEST,
+    LIFTS,
+    LYING,
+    ROUND,
+    about_y,
+    heights,
+    is_backward,
+    is_sideways_turn,
+    shifts,
+    turns_of,
+)
 
 _SIZES = (0.12, 2.1)
 """The largest extent of a garment [m]: from a sock to a gown with a train."""
@@ -27,23 +39,28 @@ _ARMS = (0.0, 0.35, 0.6, 0.85, 1.1)
 """How far arms may hang when a search begins [rad]: T-pose to arms nearly down."""
 _RARER = ((0.6, 0.1), (0.6, 0.25), (0.6, 0.45), (0.5, 0.0, 0.5), (0.9, 0.0, 0.5))
 """Arms lowered, legs spread and elbows bent when the search begins again, because it found nothing plain [rad]."""
+_SLEEVES = (0.6, 0.0, 0.4)
+"""The same for a mesh of no known unit [rad]: long sleeves on straight arms would be found too large."""
 _BENDS = tuple(itertools.product((0.0, 0.2, 0.5, 0.8, 1.1), (0.0, 0.3)))
 """Elbows bent and arms brought forward when a search for them begins [rad]."""
+_BENT = tuple(bend for bend in _BENDS if bend[0] >= 0.5)
+"""The same for arms that are certainly bent: sleeves may fit nearly as badly on straight ones."""
 _REACH = np.array([(-0.2, 1.3), (0.0, 0.6), (0.0, 1.6), (-0.3, 0.6)]).T
 """How far arms are lowered, legs spread, elbows bent, and arms brought forward at most [rad]."""
 _TOUCHES = 1e-4
 """A mesh that lacks more than this [m] to be 1 cm off the skin, on average, is tried with bent elbows: of a loose shirt
 with sleeves, 0.002 mm with straight arms, and 0.3 mm if elbows were bent by 10°."""
 _N_POINTS = 400
-_TOLERANCE = 0.015
-"""A mesh is taken as it is unless something else fits this much better, as a share of its size."""
 _UNIT_TOLERANCE = 0.005
 """A mesh that had to be moved keeps a known unit unless another size fits this much better, likewise."""
 _MISFIT = 2.0
 """A mesh that fits in a known unit has that unit, unless another size fits this many times as well: loose cloth would
 always fit better if it were smaller."""
+_DOUBTFUL = 0.1
+"""What fits this badly where it is by convention, as a share of its size, is looked for elsewhere, too, in the same
+axes unless only sideways it fits at all: trousers are at 0.06, a shirt on the feet of a taller body at 0.18."""
 _POSE_TOLERANCE = 0.002
-"""A mesh is taken to be in the T-pose unless another pose fits this much better, likewise."""
+"""A mesh is taken to be in the T-pose, and straight, unless something else fits this much better, likewise."""
 _TRIED_SIZES = (0.25, 0.4, 0.6, 0.85, 1.2, 1.7)
 """Largest extents that a mesh of no known unit is tried with [m]."""
 _NOTHING = 0.01
@@ -52,53 +69,6 @@ _N_REFINED = 2
 _NORMED = 1e-3
 """An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit. A
 middle this near to the origin, as a share of the extent, was made so, too: the origin says nothing of the body."""
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """x_body = unit · turn x + shift, on the body in `pose`."""
-
-    unit: float
-    turn: F64
-    """Rotation, shape (3, 3)."""
-    kind: str
-    """How it was placed: as it is (empty), moved from a `floor`, or `searched`."""
-    shift: F64
-    """[m], shape (3,)."""
-    lift: float
-    """How much higher it is than by convention [m]: its wearer, or the origin of their model, was another."""
-    pose: F64
-    """Rotation vectors [rad], shape (24, 3)."""
-    fit: Fit
-    top: float
-    """How high the mesh reaches [m]."""
-    notes: list[str] = field(default_factory=list)
-    """What was found out, one sentence each."""
-
-    def is_like(self, other: Place) -> bool:
-        """Whether it has the same unit and axes, and was placed in the same way."""
-        is_as_large = (self.unit, self.kind) == (other.unit, other.kind)
-        return is_as_large and bool(np.array_equal(self.turn, other.turn))
-
-    @property
-    def is_sideways(self) -> bool:
-        """Whether the mesh would have been modelled facing x, as nobody does."""
-        return is_sideways_turn(self.turn)
-
-    def cost(self, extent: float) -> float:
-        """The cost as a share of the garment's size; otherwise the smallest size would always be nearest to the skin.
-
-        What nobody does without need counts, too: modelling a garment sideways, with spread legs, hanging or bent arms,
-        or for a body of another height.
-        """
-        arms, legs = np.abs(self.pose[[RIGHT_SHOULDER, RIGHT_ELBOW], 1:]).sum(), abs(self.pose[LEFT_HIP, 2])
-        without_need = 0.02 * self.is_sideways + 0.1 * legs + 0.005 * arms + _TOLERANCE * (self.lift != 0)
-        return float(self.fit.cost / (self.unit * extent) + without_need)
-
-    def __call__(self, vertices: F64) -> F64:
-        """Vertices (V, 3) on the body [m]."""
-        found: F64 = self.unit * vertices @ self.turn.T + self.shift
-        return found
 
 
 _UNDER_ARMS = 0.1
@@ -127,65 +97,75 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     turns = turns_of(placing.up, mesh, is_placed=placing.is_placed)
     found = search.by_convention(bodies, turns) if search.has_origin else []
     if placing.is_whole and found and found[0].fit.is_near:
-        yield _told(found[0])
+        yield search.told(found[0])
         return
     found += search.of_other_heights(found, bodies)
     if placing.pose is None and found and not any(one.fit.is_plain for one in found):
         found += search.by_convention([PosedBody(body, standing_pose(*angles)) for angles in _RARER], turns)
         near = sorted((one for one in found if one.fit.is_near), key=lambda one: one.cost(extent))
-        likely = [search.refined(one, moves=False, scales=False, bends=True) for one in near[:_N_REFINED]]
+        likely = [search.refined(one, moves=False, scales=False, bends=_BENDS) for one in near[:_N_REFINED]]
         found += [one for one in likely if one.fit.is_good]
     good = [one for one in found if one.fit.is_plain]
     if good:
         least = min(one.cost(extent) for one in good)
-        chosen = next(one for one in good if one.cost(extent) < least + _TOLERANCE)  # plain assumptions come first
+        chosen = next(one for one in good if one.cost(extent) < least + TOLERANCE)  # plain assumptions come first
+        first = [chosen]
         if placing.pose is None or chosen.lift:
             likes = sorted((one for one in found if one.is_like(chosen)), key=lambda one: one.cost(extent))
             refined = [search.refined(one, moves=False, scales=False) for one in likes[:2]]
             if min(one.fit.depth for one in refined) > _TOUCHES:
                 best = min(refined, key=lambda one: one.cost(extent))
-                refined.append(search.refined(best, moves=False, scales=False, bends=True))
+                refined.append(search.refined(best, moves=False, scales=False, bends=_BENDS))
             other = min(refined, key=lambda one: one.cost(extent))
             if other.cost(extent) < chosen.cost(extent) - _POSE_TOLERANCE or chosen.pose.any():
-                yield _told(other)  # and if a limb goes through it there:
-        yield _told(chosen)
+                first = [other, chosen]  # the second if a limb goes through it there
+        least = first[0].cost(extent)
+        if least > _DOUBTFUL and not placing.is_placed:
+            moved = [one for one in search.along(bodies, turns, units, scales=False) if one.fit.is_plain]
+            stands = not chosen.is_sideways or any(one.fit.is_good and not one.is_sideways for one in found)
+            moved = [one for one in moved if not stands or np.allclose(one.turn, chosen.turn, atol=0.5)]
+            first = [one for one in moved if _MISFIT * one.cost(extent) < least] + first
+        for one in first:
+            yield search.told(one)
     rings = [one for one in found if one.fit.is_ring and not one.kind and not one.is_sideways]
     if rings and not good:  # a mesh around the body where it was modelled isn't searched elsewhere
-        yield _told(rings[0])
+        yield search.told(rings[0])
     found.sort(key=lambda one: (not one.fit.is_good, one.cost(extent)))
     tiers = found[:1]
     for one in tiers:
         if one.fit.is_good and one.fit.inside < _NOTHING and one.fit.distance < NEAR and not one.is_sideways:
-            yield _told(one)  # much of a glove faces other fingers
+            yield search.told(one)  # much of a glove faces other fingers
     if not placing.is_placed and search.has_unit:
         tiers += search.along(bodies, turns, units, scales=False)
     if not placing.is_placed and not placing.unit:
         tiers += search.along(bodies, turns, [size / extent for size in _TRIED_SIZES], scales=True)
     # A place by convention, or else one in a known unit, comes first unless it fits much worse.
     least = min((one.cost(extent) for one in tiers if one.fit.is_good and search.knows(one)), default=math.inf)
-    if search.has_unit:
-        tiers = [one for one in tiers if search.knows(one) or _MISFIT * one.cost(extent) < least]
+    scaled = [one for one in tiers if search.has_unit and not search.knows(one) and _MISFIT * one.cost(extent) >= least]
+    tiers = [one for one in tiers if one not in scaled]
     handicap = [
-        (k > 0) * _TOLERANCE + (not search.knows(one) or one.fit.inside > _NOTHING) * _UNIT_TOLERANCE
+        (k > 0) * TOLERANCE + (not search.knows(one) or one.fit.inside > _NOTHING) * _UNIT_TOLERANCE
         for k, one in enumerate(tiers)
     ]
     ranked = sorted(range(len(tiers)), key=lambda k: tiers[k].cost(extent) + handicap[k])
     order = [tiers[k] for k in ranked if tiers[k].fit.is_good]
     tight = [one for one in found if one.fit.is_tight and not one.fit.is_good and not one.is_sideways]
+    tight = [one for one in tight if one.fit.depth or placing.is_placed]  # what stands beside the body isn't meant
     if tight and not good and search.has_unit:
         # A sleeve without an arm in it costs less, but faces the wrong way.
         best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.fit.facing))
         # A mesh in metres that is close to the skin isn't meant to be a sixth larger, or to lie.
-        first = [one for one in order if search.knows(one) and np.array_equal(one.turn, best.turn)]
+        first = [one for one in order if search.knows(one) and np.allclose(one.turn, best.turn, atol=0.5)]
         order = [*first, best, *(one for one in order if one not in first)]
+    order += [one for one in scaled if one.fit.is_good]  # if a limb goes through it everywhere else
     for one in order:
-        yield _told(one)
+        yield search.told(one)
     lying = [] if placing.up or placing.is_placed else search.along(bodies, LYING, units, scales=False)
     least = min((one.cost(extent) for one in (*good, *order)), default=math.inf)
     # Nobody wears a garment on a hand, or upside down, that can be worn upright.
     lying = [one for one in lying if one.fit.is_plain and _MISFIT * one.cost(extent) < least]
     for one in lying:
-        yield _told(one)
+        yield search.told(one)
     if good or order or lying or any(one.fit.is_good for one in tiers):
         return
     if not tiers:
@@ -197,6 +177,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         f"{1e3 * fit.distance:.0f} mm off, and {100 * fit.facing:.0f} % faces outward; say its --unit, --up or --pose, "
         f"or place it on the body first{no_opening(mesh.faces)}"
     )
+
+
+Bends = Sequence[tuple[float, float]]
 
 
 class _Search:
@@ -248,6 +231,20 @@ class _Search:
             lifted += _at(self.samples, ways, here)
         return [one for one in lifted if one.fit.distance < NEAR and not self.too_high(one, bodies[0])]
 
+    def told(self, place: Place) -> Place:
+        """The place with what was found out, in words; turned round if the mesh would be worn back to front."""
+        worn = place(self._mesh.vertices), self._mesh.faces, self._body
+        if is_backward(place.turn) and opens_behind(*worn):
+            low, high = worn[0].min(0), worn[0].max(0)
+            middle = (low + high) / 2 * (1, 0, 1)
+            start = replace(
+                place, turn=ROUND @ place.turn, shift=ROUND @ (place.shift - middle) + middle, kind="searched"
+            )
+            other = self.refined(replace(start, lift=0.0), moves=True, scales=not self.knows(place))
+            if other.fit.is_good and other.cost(self._extent) < _MISFIT * place.cost(self._extent):
+                place = other
+        return told(place)
+
     def shows_height(self, place: Place) -> bool:
         """Whether there is cloth over the shoulders or between the legs, so that it can be worn at one height only."""
         placed = place(self._mesh.vertices), self._mesh.faces, self._body
@@ -259,6 +256,8 @@ class _Search:
         few = few._replace(area=4 * few.area)
         if scales:  # there is much to try, so what nobody does is left out
             bodies, turns = bodies[:3], [turn for turn in turns if not is_sideways_turn(turn)]
+            if self._placing.pose is None:
+                bodies = [*bodies, bodies[0], PosedBody(self._body, standing_pose(*_SLEEVES))]
         found = []
         for here in bodies[::2]:
             ways = [
@@ -268,34 +267,42 @@ class _Search:
             ]
             found += [one for one in _at(few, ways, here) if not self.too_high(one, here)]
         found.sort(key=lambda one: one.cost(self._extent))
-        refined = [self.refined(one, moves=True, scales=scales) for one in found[:_N_REFINED]]
-        return sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
+        apart = [one for k, one in enumerate(found) if not any(one.turn is other.turn for other in found[:k])]
+        refined = [self.refined(one, moves=True, scales=scales) for one in apart[:_N_REFINED]]
+        best = min(refined, key=lambda one: one.cost(self._extent), default=None)
+        if best and best.fit.is_near and best.fit.depth > _TOUCHES and self._placing.pose is None:
+            refined += [self.refined(best, moves=True, scales=scales, bends=bends) for bends in (_BENDS, _BENT)]
+        first = sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
+        return first + [one for one in refined[-1:] if one not in first and len(refined) > _N_REFINED]
 
-    def refined(self, start: Place, *, moves: bool, scales: bool, bends: bool = False) -> Place:
+    def refined(self, start: Place, *, moves: bool, scales: bool, bends: Bends = ()) -> Place:
         """The best place near `start`, by a simplex search over the pose, and over place and size if wanted.
 
-        Arms come forward, and elbows bend, only if wanted: it takes twice as long.
+        Arms come forward, and elbows bend, only if it is said where to begin: it takes twice as long. A mesh that moves
+        then turns, too, as somebody does who was scanned.
         """
-        body, samples, turn = PosedBody(self._body, start.pose), self.samples, start.turn
+        body, samples = PosedBody(self._body, start.pose), self.samples
         is_posed = self._placing.pose is not None
         has_legs = parts_legs(start(self._mesh.vertices), self._mesh.faces, self._body)
         arms, elbows = start.pose[RIGHT_SHOULDER], start.pose[RIGHT_ELBOW, 1]
         angles = np.array([arms[2], max(0.02 * has_legs, start.pose[LEFT_HIP, 2]), elbows, arms[1]])
-        x0 = np.concatenate((np.zeros(4), angles))
-        turning = np.array([0.1, 0.06 * has_legs, 0.15 * bends, 0.1 * bends]) * (not is_posed)
+        x0 = np.concatenate((np.zeros(4), angles, [0.0]))
+        bent = len(bends) > 0
+        turning = np.array([0.1, 0.06 * has_legs, 0.15 * bent, 0.1 * bent]) * (not is_posed)
         rises = moves or start.lift != 0
-        steps = np.array([0.06 * scales, 0.03 * moves, 0.03 * rises, 0.03 * moves, *turning])
+        steps = np.array([0.06 * scales, 0.03 * moves, 0.03 * rises, 0.03 * moves, *turning, 0.1 * (moves and bent)])
         free = np.flatnonzero(steps)
-        middle = samples.points.mean(0) @ turn.T
+        middle = samples.points.mean(0) @ start.turn.T
         floor = body.floor
         extent = float(np.ptp(samples.points, axis=0).max())
 
         def at(full: F64) -> Place:
-            size, shift, angles = full[0], full[1:4], full[4:]
+            size, shift, angles, yaw = full[0], full[1:4], full[4:8], full[8]
+            turn = about_y(yaw) @ start.turn
             if not is_posed:
                 body.move(standing_pose(*np.clip(angles, *_REACH)))
             unit = min(start.unit * float(np.exp(np.clip(size, -0.5, 0.5))), _SIZES[1] / extent)
-            moved = start.shift + shift + (start.unit - unit) * middle  # the middle stays as the size changes
+            moved = start.shift + shift + start.unit * middle - unit * (about_y(yaw) @ middle)  # the middle stays
             if start.kind == "floor":  # the floor is where the feet of this pose are
                 moved[1] += body.floor - floor
             lift = start.lift and start.lift + float(shift[1])
@@ -317,12 +324,14 @@ class _Search:
 
         if not len(free):
             return start
-        if bends and not is_posed:
-            x0 = min((np.array([*x0[:6], *bend]) for bend in _BENDS), key=cost)
+        if bent and not is_posed:
+            x0 = min((np.array([*x0[:6], *bend, x0[8]]) for bend in bends), key=cost)
         simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
         options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
         found = minimize(cost_there, np.zeros(len(free)), method="Nelder-Mead", options=options)
-        return at(there(found.x))
+        askew = there(found.x)
+        straight = np.array([*askew[:8], 0.0])
+        return at(straight if cost(straight) < found.fun + _POSE_TOLERANCE else askew)
 
 
 class _Way(NamedTuple):
@@ -344,33 +353,3 @@ def _at(samples: Samples, ways: Sequence[_Way], body: PosedBody) -> list[Place]:
     area = np.array([[way.unit**2] for way in ways]) * samples.area
     fits, tops = fits_of(points, normals, area, samples, body), points[:, :, 1].max(1).tolist()
     return [Place(*way, body.pose, fit, top) for way, fit, top in zip(ways, fits, tops, strict=True)]
-
-
-def _told(place: Place) -> Place:
-    """The place with what was found out, in words."""
-    notes = []
-    name = next((name for name, unit in UNITS.items() if np.isclose(unit, place.unit)), None)
-    if name != "m":
-        notes.append(f"lengths are {name}" if name else f"scaled by {place.unit:.4g}, which is no unit")
-    turn = place.turn
-    if not np.allclose(turn, np.eye(3)):
-        k = int(np.abs(turn[1]).argmax())
-        up = f"{'-' if turn[1, k] < 0 else ''}{'xyz'[k]}"
-        front = turn.T @ [0.0, 0.0, 1.0]
-        axis = int(np.abs(front).argmax())
-        askew = np.degrees(np.arccos(min(1.0, abs(front[axis]))))
-        about = f"{askew:.0f}° off " if askew > 1 else ""
-        notes.append(f"{up} is up and {about}{'+' if front[axis] > 0 else '-'}{'xyz'[axis]} is in front")
-    if place.kind == "floor":
-        notes.append("it stood with the floor at 0 and was moved to the body's feet")
-        if place.lift:
-            notes[-1] += f", and {1e3 * abs(place.lift):.0f} mm {'up' if place.lift > 0 else 'down'} from there"
-    elif np.abs(place.shift).max() > 1e-3:
-        notes.append("moved by ({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * place.shift)))
-    forward, arms, elbows, legs = np.degrees(
-        [*place.pose[RIGHT_SHOULDER, 1:], place.pose[RIGHT_ELBOW, 1], place.pose[LEFT_HIP, 2]]
-    )
-    if max(abs(arms), abs(forward), elbows, legs) > 3:
-        bent = f", {forward:.0f}° forward and bent by {elbows:.0f}°" if max(abs(forward), elbows) > 3 else ""
-        notes.append(f"modelled with arms {arms:.0f}° down{bent} and legs {legs:.0f}° apart; brought into the T-pose")
-    return replace(place, notes=notes)

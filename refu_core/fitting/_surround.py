@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody
@@ -25,6 +26,9 @@ that hangs on a hand has .19."""
 _FACES, _WIDE_FACES, _PLAINLY_FACES = 0.85, 0.9, 0.93
 """Least share that faces outward: for a glove, between whose fingers much doesn't; for wide cloth, which may have 0.89
 by chance; for cloth that leaves no doubt."""
+_FOLDED, _MUCH = 0.8, 0.35
+"""Cloth in deep folds faces outward by this share at least, and encloses this much skin, as a share of its own area: a
+draped circle skirt .85 and .40."""
 _RING_FACES = 0.99
 """Least share of a ring that faces outward: a band 8 cm high and 8 cm off the hips has 1.00."""
 _N_SKIN = 600
@@ -32,6 +36,10 @@ _N_SKIN = 600
 _DOWN = np.array([0.3, 0.6, 0.9])
 """Where thighs and shins are checked for cloth between them, and shoulders for cloth above them, as shares of the way
 from one joint to the next."""
+_HEIGHT = 0.005
+"""Heights at which cloth in front and behind are counted are this far apart [m]."""
+_LOWER = 0.02
+"""A neckline is lower on one side if it is so by more than this [m]: those of T-shirts are by 4 to 9 cm."""
 _ACROSS = 0.5
 """Least cosine between the normal of cloth that lies along the skin and the way off the skin, or across some way."""
 
@@ -68,7 +76,8 @@ class Fit:
         A gown or a poncho is far off, but has much of the body in it: a shirt that hangs on a hand has not.
         """
         least, faces = (0, _FACES) if self.distance < NEAR else (_WIDE, _WIDE_FACES)
-        return self.inside < 0.05 and self.facing > faces and self.around > least
+        is_around = (self.facing > faces and self.around > least) or (self.facing > _FOLDED and self.around > _MUCH)
+        return self.inside < 0.05 and is_around
 
     @property
     def is_near(self) -> bool:
@@ -193,6 +202,23 @@ def lies_over(vertices: F64, faces: Ints, body: SmplBody) -> bool:
     low, high = vertices[:, 1].min() - 1, vertices[:, 1].max() + 1
     over[:, 1] = low
     return _crosses(vertices, faces, over, np.tile([0.0, high - low, 0.0], (len(over), 1)))
+
+
+def opens_behind(vertices: F64, faces: Ints, body: SmplBody) -> bool:
+    """Whether cloth of vertices (V, 3) [m] would be worn back to front: coats open, and necklines are lower, in front.
+
+    In the body's plane of symmetry, cloth is then in front of the spine at more heights than it is behind it.
+    """
+    segments = trimesh.intersections.mesh_plane(
+        trimesh.Trimesh(vertices, faces, process=False), np.eye(3)[0], np.zeros(3)
+    )
+    spine = body.joint_template[[0, 3, 6, 9, 12, 15]].double().numpy()
+    ends = np.asarray(segments, np.float64)[:, :, 1:]
+    is_front = ends[..., 1].mean(1) > np.interp(ends[..., 0].mean(1), spine[:, 1], spine[:, 2])
+    heights = np.arange(spine[0, 1], vertices[:, 1].max(), _HEIGHT)[:, None]
+    low, high = ends[..., 0].min(1), ends[..., 0].max(1)
+    front, back = (((low[side] <= heights) & (heights <= high[side])).any(1).sum() for side in (is_front, ~is_front))
+    return bool((front - back) * _HEIGHT > _LOWER)
 
 
 def _crosses(vertices: F64, faces: Ints, starts: F64, ways: F64) -> bool:

@@ -25,18 +25,21 @@ def turns_of(up: str | None, mesh: SurfaceMesh, *, is_placed: bool) -> list[F64]
     bases = {"y": [np.eye(3)], "z": [z_up], None: [np.eye(3), z_up]}[up]
     if is_placed:
         return bases
-    found = [_about_y(quarters * np.pi / 2) @ base for quarters in (0, 2, 1, -1) for base in bases]
+    found = [about_y(quarters * np.pi / 2) @ base for quarters in (0, 2, 1, -1) for base in bases]
     askew = [(_skew(mesh, base), base) for base in bases]
-    return found + [_about_y(half - angle) @ base for half in (0, np.pi) for angle, base in askew if angle]
+    return found + [about_y(half - angle) @ base for half in (0, np.pi) for angle, base in askew if angle]
 
 
-def _about_y(angle: float) -> F64:
+def about_y(angle: float) -> F64:
+    """The rotation by some angle [rad] about the axis that is up."""
     cos, sin = np.cos(angle).round(12), np.sin(angle).round(12)
     return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
 
 
+ROUND = about_y(np.pi)
+"""Turns a mesh round."""
 LYING = [
-    _about_y(quarters * np.pi / 2) @ np.array(base, np.float64)
+    about_y(quarters * np.pi / 2) @ np.array(base, np.float64)
     for quarters in (0, 2, 1, -1)
     for base in (
         [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
@@ -64,6 +67,11 @@ def _skew(mesh: SurfaceMesh, base: F64) -> float:
 
 def is_sideways_turn(turn: F64) -> bool:
     return abs(float(turn[0, 0])) < 0.5
+
+
+def is_backward(turn: F64) -> bool:
+    """Whether a mesh that is turned like that, with y or z up, faces where nobody's does by convention: -z or +y."""
+    return float(turn[0, 0]) < -0.5 and float(turn[1].max()) > 0.5
 
 
 def shifts(body: PosedBody, *, is_placed: bool) -> list[tuple[str, F64]]:

@@ -19,9 +19,10 @@ from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.fitting import Placing, SurfaceMesh, _fit, fit_garment, standing_pose
 from refu_core.fitting._clean import components, no_opening
+from refu_core.fitting._found import Place
 from refu_core.fitting._pieces import without_floor, without_specks
-from refu_core.fitting._place import Place, find_places
-from refu_core.fitting._surround import parts_legs
+from refu_core.fitting._place import find_places
+from refu_core.fitting._surround import opens_behind, parts_legs
 from refu_core.mesh import rim_of, vertex_normals
 
 SHIRT = Wanted(low=0.66, sleeve=0.6, step=0.028)
@@ -298,3 +299,40 @@ def test_cloth_with_two_sides_is_worn_with_its_outer_one(n_panels: int) -> None:
     assert made.template.faces.shape == plain.faces.shape
     assert components(made.template.faces.numpy(), made.template.n_vertices)[0] == 2
     assert float((made.template.v_template - plain.v_template).norm(dim=1).median()) < 1e-3
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+def test_what_opens_in_front_is_seen(is_open: bool) -> None:
+    """Robes and jackets were worn back to front: they fit as well like that."""
+    garment = load_garment("tshirt-male")
+    v, f, body = garment.v_template.double().numpy(), garment.faces.numpy(), load_body("male")
+    middle = v[f].mean(1)
+    f = f[~(is_open & (np.abs(middle[:, 0]) < 0.03) & (middle[:, 2] > 0.04))]
+    assert not opens_behind(v, f, body)
+    assert opens_behind(v * [-1, 1, -1], f, body)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_coat_opens_in_front(up: str) -> None:
+    """It is the mirror image of a shirt: its back is where a chest is. Robes and jackets were worn back to front."""
+    garment = load_garment("longsleeve-male")
+    v, f, body = garment.v_template.double().numpy(), garment.faces.numpy(), load_body("male")
+    middle = v[f].mean(1)
+    f = f[~((np.abs(middle[:, 0]) < 0.03) & (middle[:, 2] < -0.02))][:, ::-1]
+    v = (v - v.mean(0)) * [1.6, 1.6, -1.6]
+    base = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}[up]
+    place = next(find_places(SurfaceMesh(v @ base, f), body, Placing()))
+    np.testing.assert_allclose(place.turn, base, atol=1e-9)
+
+
+def test_a_scanned_person_stands_askew() -> None:
+    """Sleeves of somebody scanned, forearms forward and trunk turned, lay beside the arms, and were found too long."""
+    garment = load_garment("longsleeve-male")
+    body, pose = load_body("male"), standing_pose(0.8, 0.0, 0.5, 0.2)
+    transforms = body(torch.as_tensor(pose, dtype=torch.float32)[None]).transforms
+    v = apply_transforms(garment.v_template[None], blend_transforms(garment.weights, transforms))[0].double().numpy()
+    turn = Rotation.from_euler("y", 14, degrees=True).as_matrix()
+    place = next(find_places(SurfaceMesh(0.93 * (v - v.mean(0)) @ turn.T, garment.faces.numpy()), body, Placing()))
+    assert place.unit == pytest.approx(1 / 0.93, rel=0.05)
+    np.testing.assert_allclose(place.turn, turn.T, atol=0.05)
+    np.testing.assert_allclose(place.pose[[17, 19]], pose[[17, 19]], atol=0.09)
