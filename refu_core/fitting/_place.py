@@ -179,9 +179,6 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     )
 
 
-Bends = Sequence[tuple[float, float]]
-
-
 class _Search:
     """Looks for places of a mesh that isn't where it belongs."""
 
@@ -254,12 +251,13 @@ class _Search:
         """The best place at any height along the body, refined from there; none if there are no heights."""
         few = Samples(*(array[::4] for array in self.samples))  # type: ignore[arg-type]
         few = few._replace(area=4 * few.area)
+        bodies = bodies[::2]
         if scales:  # there is much to try, so what nobody does is left out
-            bodies, turns = bodies[:3], [turn for turn in turns if not is_sideways_turn(turn)]
+            bodies, turns = bodies[:2], [turn for turn in turns if not is_sideways_turn(turn)]
             if self._placing.pose is None:
-                bodies = [*bodies, bodies[0], PosedBody(self._body, standing_pose(*_SLEEVES))]
+                bodies.append(PosedBody(self._body, standing_pose(*_SLEEVES)))
         found = []
-        for here in bodies[::2]:
+        for here in bodies:
             ways = [
                 _Way(unit, turn, "searched", shift)
                 for turn, unit in itertools.product(turns, units)
@@ -275,7 +273,7 @@ class _Search:
         first = sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
         return first + [one for one in refined[-1:] if one not in first and len(refined) > _N_REFINED]
 
-    def refined(self, start: Place, *, moves: bool, scales: bool, bends: Bends = ()) -> Place:
+    def refined(self, start: Place, *, moves: bool, scales: bool, bends: Sequence[tuple[float, float]] = ()) -> Place:
         """The best place near `start`, by a simplex search over the pose, and over place and size if wanted.
 
         Arms come forward, and elbows bend, only if it is said where to begin: it takes twice as long. A mesh that moves
