@@ -42,6 +42,10 @@ class Place:
         is_as_large = (self.unit, self.kind) == (other.unit, other.kind)
         return is_as_large and bool(np.array_equal(self.turn, other.turn))
 
+    def faces_as(self, other: Place) -> bool:
+        """Whether it has the same axes, but for what a trunk may be turned."""
+        return bool(np.allclose(self.turn, other.turn, atol=0.5))
+
     @property
     def is_sideways(self) -> bool:
         """Whether the mesh would have been modelled facing x, as nobody does."""

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from refu_core.body import SmplBody
 from refu_core.errors import GarmentError
 from refu_core.fitting._clean import no_opening
 from refu_core.fitting._found import TOLERANCE, Place, told
-from refu_core.fitting._mesh_file import F64, SurfaceMesh
+from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.fitting._placing import UNITS, Placing
 from refu_core.fitting._posed import LEFT_HIP, LEFT_SHOULDER, RIGHT_ELBOW, RIGHT_SHOULDER, PosedBody, standing_pose
 from refu_core.fitting._surround import NEAR, Samples, fits_of, lies_over, opens_behind, parts_legs, sample
@@ -95,6 +96,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
     turns = turns_of(placing.up, mesh, is_placed=placing.is_placed)
+    in_units = cache(lambda: search.along(bodies, turns, units, scales=False))  # only if it's needed, and once
     found = search.by_convention(bodies, turns) if search.has_origin else []
     if placing.is_whole and found and found[0].fit.is_near:
         yield search.told(found[0])
@@ -121,9 +123,9 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
                 first = [other, chosen]  # the second if a limb goes through it there
         least = first[0].cost(extent)
         if least > _DOUBTFUL and not placing.is_placed:
-            moved = [one for one in search.along(bodies, turns, units, scales=False) if one.fit.is_plain]
+            moved = [one for one in in_units() if one.fit.is_plain]
             stands = not chosen.is_sideways or any(one.fit.is_good and not one.is_sideways for one in found)
-            moved = [one for one in moved if not stands or np.allclose(one.turn, chosen.turn, atol=0.5)]
+            moved = [one for one in moved if not stands or one.faces_as(chosen)]
             first = [one for one in moved if _MISFIT * one.cost(extent) < least] + first
         for one in first:
             yield search.told(one)
@@ -136,7 +138,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         if one.fit.is_good and one.fit.inside < _NOTHING and one.fit.distance < NEAR and not one.is_sideways:
             yield search.told(one)  # much of a glove faces other fingers
     if not placing.is_placed and search.has_unit:
-        tiers += search.along(bodies, turns, units, scales=False)
+        tiers += in_units()
     if not placing.is_placed and not placing.unit:
         tiers += search.along(bodies, turns, [size / extent for size in _TRIED_SIZES], scales=True)
     # A place by convention, or else one in a known unit, comes first unless it fits much worse.
@@ -155,7 +157,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         # A sleeve without an arm in it costs less, but faces the wrong way.
         best = min(tight, key=lambda one: one.cost(extent) + 4 * (1 - one.fit.facing))
         # A mesh in metres that is close to the skin isn't meant to be a sixth larger, or to lie.
-        first = [one for one in order if search.knows(one) and np.allclose(one.turn, best.turn, atol=0.5)]
+        first = [one for one in order if search.knows(one) and one.faces_as(best)]
         order = [*first, best, *(one for one in order if one not in first)]
     order += [one for one in scaled if one.fit.is_good]  # if a limb goes through it everywhere else
     for one in order:
@@ -230,10 +232,9 @@ class _Search:
 
     def told(self, place: Place) -> Place:
         """The place with what was found out, in words; turned round if the mesh would be worn back to front."""
-        worn = place(self._mesh.vertices), self._mesh.faces, self._body
-        if is_backward(place.turn) and opens_behind(*worn):
-            low, high = worn[0].min(0), worn[0].max(0)
-            middle = (low + high) / 2 * (1, 0, 1)
+        if is_backward(place.turn) and opens_behind(*self._worn(place)):
+            vertices = place(self._mesh.vertices)
+            middle = (vertices.min(0) + vertices.max(0)) / 2 * (1, 0, 1)
             start = replace(
                 place, turn=ROUND @ place.turn, shift=ROUND @ (place.shift - middle) + middle, kind="searched"
             )
@@ -244,11 +245,16 @@ class _Search:
 
     def shows_height(self, place: Place) -> bool:
         """Whether there is cloth over the shoulders or between the legs, so that it can be worn at one height only."""
-        placed = place(self._mesh.vertices), self._mesh.faces, self._body
-        return lies_over(*placed) or parts_legs(*placed)
+        return lies_over(*self._worn(place)) or parts_legs(*self._worn(place))
+
+    def _worn(self, place: Place) -> tuple[F64, Ints, SmplBody]:
+        return place(self._mesh.vertices), self._mesh.faces, self._body
 
     def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
-        """The best place at any height along the body, refined from there; none if there are no heights."""
+        """The best place at any height along the body, refined from there; none if there are no heights.
+
+        Where cloth touches skin on straight arms, the best with bent elbows comes second.
+        """
         few = Samples(*(array[::4] for array in self.samples))  # type: ignore[arg-type]
         few = few._replace(area=4 * few.area)
         bodies = bodies[::2]
@@ -268,10 +274,11 @@ class _Search:
         apart = [one for k, one in enumerate(found) if not any(one.turn is other.turn for other in found[:k])]
         refined = [self.refined(one, moves=True, scales=scales) for one in apart[:_N_REFINED]]
         best = min(refined, key=lambda one: one.cost(self._extent), default=None)
+        bent = []
         if best and best.fit.is_near and best.fit.depth > _TOUCHES and self._placing.pose is None:
-            refined += [self.refined(best, moves=True, scales=scales, bends=bends) for bends in (_BENDS, _BENT)]
-        first = sorted(refined, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
-        return first + [one for one in refined[-1:] if one not in first and len(refined) > _N_REFINED]
+            bent = [self.refined(best, moves=True, scales=scales, bends=bends) for bends in (_BENDS, _BENT)]
+        first = sorted(refined + bent, key=lambda one: (not one.fit.is_good, one.cost(self._extent)))[:1]
+        return first + [one for one in bent[-1:] if one not in first]
 
     def refined(self, start: Place, *, moves: bool, scales: bool, bends: Sequence[tuple[float, float]] = ()) -> Place:
         """The best place near `start`, by a simplex search over the pose, and over place and size if wanted.
@@ -281,7 +288,7 @@ class _Search:
         """
         body, samples = PosedBody(self._body, start.pose), self.samples
         is_posed = self._placing.pose is not None
-        has_legs = parts_legs(start(self._mesh.vertices), self._mesh.faces, self._body)
+        has_legs = parts_legs(*self._worn(start))
         arms, elbows = start.pose[RIGHT_SHOULDER], start.pose[RIGHT_ELBOW, 1]
         angles = np.array([arms[2], max(0.02 * has_legs, start.pose[LEFT_HIP, 2]), elbows, arms[1]])
         x0 = np.concatenate((np.zeros(4), angles, [0.0]))
@@ -327,9 +334,11 @@ class _Search:
         simplex = np.concatenate((np.zeros((1, len(free))), np.eye(len(free))))
         options: Any = {"initial_simplex": simplex, "maxfev": 30 * len(free), "xatol": 0.02, "fatol": 1e-5}
         found = minimize(cost_there, np.zeros(len(free)), method="Nelder-Mead", options=options)
-        askew = there(found.x)
-        straight = np.array([*askew[:8], 0.0])
-        return at(straight if cost(straight) < found.fun + _POSE_TOLERANCE else askew)
+        best = there(found.x)
+        straight = np.array([*best[:8], 0.0])
+        if best[8] and cost(straight) < found.fun + _POSE_TOLERANCE:
+            best = straight
+        return at(best)
 
 
 class _Way(NamedTuple):
