@@ -20,6 +20,7 @@ from refu_core.keypoints import Proportions
 from refu_core.recordings._followed import follow, metres_of
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps
+from refu_core.recordings._retarget import SourceSkeleton, fitted_betas, retargeted
 from refu_core.recordings._upright import Array, Axes
 
 _MAX_BYTES = 256 << 20
@@ -67,7 +68,7 @@ def read_bvh(
     try:
         joints, rows, seconds = _parsed(text)
         rate = check_fps(fps if fps is not None else 1 / seconds if seconds > 0 else 0.0)
-        return _fitted(joints, _placed(joints, rows), rate, axes, worn)
+        return _fitted(joints, *_placed(joints, rows), rate, axes, worn)
     except ValueError as cause:
         raise error(f"{path}: {cause}") from cause
 
@@ -127,8 +128,8 @@ def _joints(words: Iterator[str]) -> list[_Joint]:
     return joints
 
 
-def _placed(joints: list[_Joint], rows: Array) -> Array:
-    """Positions of the joints in the file's units, shape (T, J, 3)."""
+def _placed(joints: list[_Joint], rows: Array) -> tuple[Array, Array]:
+    """Positions of the joints in the file's units, shape (T, J, 3), and their rotations in the world, (J, T, 3, 3)."""
     places, turns = np.zeros((len(joints), len(rows), 3)), np.zeros((len(joints), len(rows), 3, 3))
     start = 0
     for i, joint in enumerate(joints):
@@ -154,23 +155,34 @@ def _placed(joints: list[_Joint], rows: Array) -> Array:
             above = turns[joint.parent]
             places[i] = places[joint.parent] + np.einsum("tij,tj->ti", above, way)
             turns[i] = above @ turn
-    frames: Array = places.swapaxes(0, 1)
-    return frames
+    return places.swapaxes(0, 1), turns
 
 
-def _fitted(joints: list[_Joint], places: Array, fps: float, axes: Axes, worn: Proportions | None) -> Recording:
+def _fitted(
+    joints: list[_Joint], places: Array, turns: Array, fps: float, axes: Axes, worn: Proportions | None
+) -> Recording:
     points = _points(joints, places[0])
     missing = [name for name in _NEEDED if name not in points]
     if missing:
         names = ", ".join(joint.name for joint in joints[:12] if joint.name)
         raise ValueError(f"not a person's skeleton, or its names aren't known: no {', '.join(missing)} among {names} …")
     notes: list[str] = []
-    scale = metres_of(list(points), places[0, list(points.values())], notes)
-    seen = scale * places[:, list(points.values())]
+    places = places * metres_of(list(points), places[0, list(points.values())], notes)
+    rest = np.zeros((len(joints), 3))
+    for i, joint in enumerate(joints):
+        rest[i] = joint.offset if joint.parent < 0 else rest[joint.parent] + joint.offset
+    source = SourceSkeleton(points, [joint.parent for joint in joints], rest, places, turns)
     lost = [name for name in _POINTS if name not in points]
     without = f"; not found by their names: {', '.join(lost)}" if lost else ""
-    notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}{without}")
-    return follow(tuple(points), seen, fps=fps, axes=axes, usual="smpl", worn=worn, notes=notes)
+    body = Proportions.builtin("neutral") if worn is None else worn
+    betas = fitted_betas(source, body)
+    on_body = retargeted(source, body.of(betas))
+    seen = {name: source.at(name) for name in points} if on_body is None else on_body
+    turned = "" if on_body is None else "; its trunk and head turn as these joints do"
+    notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}{without}{turned}")
+    found = np.stack(list(seen.values()), axis=1)
+    known = None if on_body is None else betas
+    return follow(tuple(seen), found, fps=fps, axes=axes, usual="smpl", worn=worn, betas=known, notes=notes)
 
 
 def _points(joints: list[_Joint], places: Array) -> dict[str, int]:

@@ -50,6 +50,7 @@ def follow(
     usual: Axes,
     worn: Proportions | None,
     notes: list[str],
+    betas: NDArray[np.float64] | None = None,
 ) -> Recording:
     """The motion of a person whose `points`, named as in the keypoint layouts, are at `places` (T, K, 3) [m].
 
@@ -60,12 +61,13 @@ def follow(
     """
     known_body = Proportions.builtin("neutral") if worn is None else worn
     skeleton = Skeleton(layout_of("recording", tuple(points)), known_body)
-    some = np.linspace(0, len(places) - 1, min(_FIT, len(places))).astype(int)
-    shapes = [KeypointTracker(skeleton, settings=_SETTINGS).update(places[i], 0) for i in some]
-    known = [frame.betas for frame in shapes if frame is not None]
-    if not known:
-        raise ValueError("its joints are in no order that a person's are in")
-    betas = np.median(known, axis=0)
+    if betas is None:
+        some = np.linspace(0, len(places) - 1, min(_FIT, len(places))).astype(int)
+        shapes = [KeypointTracker(skeleton, settings=_SETTINGS).update(places[i], 0) for i in some]
+        known = [frame.betas for frame in shapes if frame is not None]
+        if not known:
+            raise ValueError("its joints are in no order that a person's are in")
+        betas = np.median(known, axis=0)
     track = KeypointTracker(skeleton, betas=betas, settings=_SETTINGS)
     frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
     poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])

@@ -6,6 +6,7 @@ import base64
 import collections
 import pickle
 import zlib
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -319,15 +320,29 @@ XSENS = "Hips LeftHip RightHip Chest LeftKnee RightKnee Chest2 LeftAnkle RightAn
 XSENS += "LeftCollar RightCollar Head LeftShoulder RightShoulder LeftElbow RightElbow LeftWrist RightWrist LH RH"
 
 
-def bvh(names: list[str], unit: float, n: int = 8) -> tuple[str, NDArray[np.float64]]:
-    """A file of the male body's skeleton, and its joints in metres, shape (n, 24, 3)."""
+def bvh(
+    names: list[str],
+    unit: float,
+    n: int = 8,
+    *,
+    moved: Mapping[str, tuple[float, float, float]] | None = None,
+    axes: NDArray[np.float64] | None = None,
+) -> tuple[str, NDArray[np.float64]]:
+    """A file of the male body's skeleton, and its joints in metres, shape (n, 24, 3).
+
+    Joints at rest may be `moved` [m], and have `axes` (24, 3, 3) of their own.
+    """
     body = load_body("male", dtype=torch.float64)
     rest = body.rest_joints(torch.zeros(1, 10, dtype=torch.float64))[0].numpy()
+    for name, way in (moved or {}).items():
+        rest[JOINT_NAMES.index(name)] += way
+    own = np.broadcast_to(np.eye(3), (24, 3, 3)) if axes is None else axes
     lines, order = ["HIERARCHY"], []
 
     def add(joint: int) -> None:
         order.append(joint)
-        offset = unit * (rest[joint] - rest[max(PARENTS[joint], 0)])
+        above = own[PARENTS[joint]] if joint else np.eye(3)
+        offset = above.T @ (unit * (rest[joint] - rest[max(PARENTS[joint], 0)]))
         kind, channels = ("JOINT", "3") if joint else ("ROOT", "6 Xposition Yposition Zposition")
         lines.extend([f"{kind} {names[joint]}", "{", f"OFFSET {' '.join(map(str, offset))}"])
         lines.append(f"CHANNELS {channels} Zrotation Yrotation Xrotation")
@@ -343,7 +358,9 @@ def bvh(names: list[str], unit: float, n: int = 8) -> tuple[str, NDArray[np.floa
     for pose, transl in zip(POSES[:n], TRANSL[:n], strict=True):
         row = [*(unit * (transl + rest[0]))]
         for joint in order:
-            row += [*Rotation.from_rotvec(pose[joint]).as_euler("ZYX", degrees=True)]
+            above = own[PARENTS[joint]] if joint else np.eye(3)
+            turn = Rotation.from_matrix(above.T @ Rotation.from_rotvec(pose[joint]).as_matrix() @ own[joint])
+            row += [*turn.as_euler("ZYX", degrees=True)]
         lines.append(" ".join(f"{number:.6f}" for number in row))
     return "\n".join(lines), body(POSES[:n], transl=TRANSL[:n]).joints.numpy()
 
@@ -368,6 +385,52 @@ def test_bvh(tmp_path: Path, names: str, prefix: str, unit: float, said: str) ->
     limbs = [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in
              ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")]  # fmt: skip
     assert np.linalg.norm(got - joints, axis=2)[:, limbs].max() < 0.012
+
+
+ELSEWHERE = {
+    "pelvis": (0.0, 0.09, 0.0),
+    "spine1": (0.0, 0.05, 0.02),
+    "neck": (0.0, -0.06, 0.03),
+    "head": (0.0, 0.04, -0.03),
+}
+ELSEWHERE |= {"left_shoulder": (0.02, -0.03, 0.0), "right_shoulder": (-0.02, -0.03, 0.0), "left_hip": (0.03, 0.0, 0.0)}
+ELSEWHERE |= {"right_hip": (-0.03, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("along_bones", [False, True])
+@pytest.mark.parametrize("longer", [-0.08, 0.0, 0.08])
+def test_bvh_of_a_skeleton_that_is_not_smpl(tmp_path: Path, longer: float, along_bones: bool) -> None:
+    """Somebody who stands isn't bent because tools put joints elsewhere, or make longer trunks (by so much [m])."""
+    upper = [i for i, name in enumerate(JOINT_NAMES) if "spine" in name or i > 11]
+    moved = {JOINT_NAMES[i]: np.array([0.0, longer, 0.0]) for i in upper}
+    moved = {name: tuple(moved.get(name, 0.0) + np.array(ELSEWHERE.get(name, (0.0, 0.0, 0.0)))) for name in JOINT_NAMES}
+    axes = None
+    if along_bones:  # of the trunk x is up, from the chest on turned by 90°; elsewhere they are any
+        axes = Rotation.random(24, random_state=0).as_matrix()
+        axes[[0, 3, 6]] = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        axes[[9, 12, 15]] = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    text, _ = bvh(MIXAMO.split(), 100.0, moved=moved, axes=axes)
+    (tmp_path / "a.bvh").write_text(text)
+    motion = read_motion(tmp_path / "a.bvh")
+    body = load_body("neutral")
+    got, wanted = (world_turns(poses) for poses in (motion.poses, POSES[:8]))
+    for joint in ("pelvis", "spine3", "head"):
+        i = JOINT_NAMES.index(joint)
+        off = np.degrees((Rotation.from_matrix(got[:, i]).inv() * Rotation.from_matrix(wanted[:, i])).magnitude())
+        assert off.max() < (12 if along_bones and joint == "head" else 5), joint
+    posed, true = (body(poses).joints.numpy() for poses in (motion.poses, POSES[:8]))
+    for a, b in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist")):
+        ways = [j[:, JOINT_NAMES.index(f"left_{b}")] - j[:, JOINT_NAMES.index(f"left_{a}")] for j in (posed, true)]
+        cosine = (ways[0] * ways[1]).sum(1) / np.linalg.norm(ways[0], axis=1) / np.linalg.norm(ways[1], axis=1)
+        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 15, (a, b)
+
+
+def world_turns(poses: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The rotation of each joint in the world, shape (n, 24, 3, 3)."""
+    turns = np.stack([Rotation.from_rotvec(pose).as_matrix() for pose in poses])
+    for i in range(1, 24):
+        turns[:, i] = turns[:, PARENTS[i]] @ turns[:, i]
+    return turns
 
 
 def test_bvh_of_somebody_with_one_hand(tmp_path: Path) -> None:
