@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, partial
 from multiprocessing import forkserver
 from pathlib import Path
@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 import refu_core
 from refu_core._engine import Engine
 from refu_core.body import Collider, SmplBody, load_body
-from refu_core.errors import BodyError
+from refu_core.errors import BodyError, MeshError
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
@@ -160,6 +160,13 @@ def test_a_hanging_arm_stays_where_it_is() -> None:
     assert checker.check(drape.vertices, garment.faces).is_free
     checker.update(skin)
     assert checker.check(drape.vertices, garment.faces).n_inside > 20
+
+
+def test_a_closed_mesh_has_no_waistband() -> None:
+    skirt, body = load_garment("skirt-female"), load_body("female")
+    closed = replace(skirt, faces=body.faces, weights=body.weights, v_template=body.v_template)
+    with pytest.raises(MeshError, match="skirt-female is held at the waist, and its mesh is closed"):
+        Draper(closed, body)
 
 
 def test_cloth_stretches_little(samples: list[GarmentSample]) -> None:
