@@ -186,8 +186,8 @@ class Draper:
     ) -> None:
         """Prepares for `garment`, or several that are worn together, on `body`, all on the CPU.
 
-        Raises `MeshError` when the body isn't watertight, an edge of a garment doesn't have one or two faces, or one
-        that is held at the waist is closed.
+        Raises `MeshError` when the body isn't watertight, a garment has edges of more than two faces or vertices of
+        none, or one that is held at the waist is closed.
         """
         self.outfit = garment if isinstance(garment, JoinedGarments) else JoinedGarments([garment])
         self.garment = garment = self.outfit.joined

@@ -32,6 +32,7 @@ from refu_core._engine import Engine
 from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import BodyError, MeshError
 from refu_core.garments import load_garment
+from refu_core.mesh import Connectivity
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
     POSTURES,
@@ -50,6 +51,7 @@ from refu_core.simulation import (
     split_clips,
     summarise,
 )
+from refu_core.simulation._cloth import ClothTopology
 from refu_core.simulation._drape import CANONICAL_POSE, COMFORT_POSES
 from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._store import CAUSES, DONE, FORMAT, QUANTUM, TO_DO, Rows, dequantise, locked, quantise
@@ -167,6 +169,11 @@ def test_a_closed_mesh_has_no_waistband() -> None:
     closed = replace(skirt, faces=body.faces, weights=body.weights, v_template=body.v_template)
     with pytest.raises(MeshError, match="skirt-female is held at the waist, and its mesh is closed"):
         Draper(closed, body)
+
+
+def test_vertices_of_no_face_are_refused() -> None:
+    with pytest.raises(MeshError, match="1 of a garment's vertices belong to no face: leave them out"):
+        ClothTopology.of(Connectivity.of([[0, 1, 2]], 4))
 
 
 def test_cloth_stretches_little(samples: list[GarmentSample]) -> None:
