@@ -185,13 +185,16 @@ def _regressor(body: SmplBody, vertices: Array, directions: Array) -> Array:
 def load_fit(
     body: str | PathLike[str] | SmplBody, *, betas_from: bool = False, device: str | torch.device = "cpu"
 ) -> BodyFit:
-    """Loads a body and lays the built-in mesh onto it, which takes some seconds for a body not seen before.
+    """Loads a body, in float32, and lays the built-in mesh onto it: some seconds for a body not seen before.
 
     With `betas_from` it is the same body on the built-in mesh, whatever its own mesh is like (`BodyFit.resampled`).
 
     Raises `BodyError`: no such body, or one that isn't in metres, upright, in the T-pose, closed (`require_rest_pose`).
     """
-    loaded = body.to(device=device) if isinstance(body, SmplBody) else load_body(body, device=device)
+    if isinstance(body, SmplBody):
+        loaded = body.to(device=device, dtype=torch.float32)
+    else:
+        loaded = load_body(body, device=device)
     source = load_body(REGISTERED)
     # The built-in bodies share one mesh.
     is_built_in = np.array_equal(loaded.arrays.faces, source.arrays.faces)

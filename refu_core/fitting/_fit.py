@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, unapply_transforms
+from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, load_body, unapply_transforms
 from refu_core.errors import GarmentError, require_type
 from refu_core.fitting._clean import MAX_VERTICES, clean, components, no_opening, split_long_edges, turned_over
 from refu_core.fitting._found import Place
@@ -93,7 +93,7 @@ def fit_garment(
 ) -> FittedGarment:
     """Makes a garment from a mesh that was made for roughly this body: it can be worn at once, without networks.
 
-    The `mesh` is as `read_surface` reads it, the `body` one of the built-in ones, on the CPU. `placing` tells what is
+    The `mesh` is as `read_surface` reads it, the `body` one of the built-in ones. `placing` tells what is
     known about the mesh's unit, axes, place and pose; by default all of it is found out. Edges longer than
     `longest_edge` [m] are split. Raises `GarmentError` for a mesh that can't be worn, with why, and what to do.
     """
@@ -103,11 +103,13 @@ def fit_garment(
     if details.held_at not in (None, *HOLDS):
         raise GarmentError(f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}")
     require_name(name)
-    if body.name not in BUILTIN_BODIES:
+    # A file may be called as a built-in body.
+    if body.name not in BUILTIN_BODIES or body.fingerprint != load_body(body.name).fingerprint:
         raise GarmentError(
-            f"a garment is cut for one of {', '.join(BUILTIN_BODIES)}, got the body {body.name}: add it for the one "
-            f"that is most like it; a replay or pipeline with {body.name} as its body (--body) then wears it, too"
+            f"a garment is cut for a built-in body ({', '.join(BUILTIN_BODIES)}), got another, {body.name}: add it for "
+            f"the one that is most like it; a replay or pipeline with {body.name} as its body (--body) wears it, too"
         )
+    body = load_body(body.name)  # in float32, on the CPU
     cleaned, notes = clean(mesh)
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"

@@ -69,7 +69,11 @@ class SurfaceMesh:
         if largest > _SIZES[1] or extent < _SIZES[0]:
             wanted = f"wanted sizes from {_SIZES[0]:g} to {_SIZES[1]:g}"
             raise GarmentError(f"it is {extent:.3g} large and reaches to {largest:.3g}: {wanted}")
-        if self.uv is not None and (self.uv.faces.min() < 0 or self.uv.faces.max() >= len(self.uv.coordinates)):
+        if self.uv is None:
+            return
+        if np.shape(self.uv.faces) != f.shape:
+            raise GarmentError(f"texture coordinates of the corners must be {f.shape}, got {np.shape(self.uv.faces)}")
+        if self.uv.faces.min() < 0 or self.uv.faces.max() >= len(self.uv.coordinates):
             raise GarmentError("a face names texture coordinates that there aren't")
 
     def only(self, kept: NDArray[np.bool_]) -> SurfaceMesh:

@@ -9,7 +9,7 @@ import numpy as np
 
 from refu_core.errors import GarmentError
 from refu_core.fitting._mesh_file import F64
-from refu_core.frames import N_JOINTS
+from refu_core.frames import MAX_ANGLE, N_JOINTS, checked_numbers
 
 UNITS: dict[str, float] = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres of a unit."""
@@ -37,11 +37,12 @@ class Placing:
         return self.is_placed and None not in (self.unit, self.up) and self.pose is not None
 
     def __post_init__(self) -> None:
-        """Raises `GarmentError` for what is no unit, no axis or no pose."""
-        is_number = isinstance(self.unit, (int, float)) and not isinstance(self.unit, bool)
+        """Raises `GarmentError` for what is no unit or no axis, `FrameError` for what is no pose."""
+        is_number = isinstance(self.unit, (int, float, np.floating)) and not isinstance(self.unit, bool)
         is_unit = self.unit is None or (is_number and 0 < self.unit < math.inf)
         if not is_unit or self.up not in (None, *UP_AXES):
             msg = f"wanted a unit in metres (0.01 for cm) and y or z up, got {self.unit!r} and {self.up!r}"
             raise GarmentError(msg)
-        if self.pose is not None and not (np.shape(self.pose) == (N_JOINTS, 3) and np.isfinite(self.pose).all()):
-            raise GarmentError(f"wanted a pose of {N_JOINTS} finite rotation vectors, got {self.pose!r}")
+        if self.pose is not None:
+            pose = checked_numbers("the mesh's pose", self.pose, (N_JOINTS, 3), np.float64, MAX_ANGLE)
+            vars(self)["pose"] = pose.copy()  # torch warns about read-only arrays

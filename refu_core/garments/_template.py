@@ -59,8 +59,10 @@ class GarmentCard:
         checks = {
             "layer": (_is_whole(self.layer, _MAX_LAYER), f"a whole number up to {_MAX_LAYER}"),
             "color": (
-                len(self.color) == 3 and all(_is_number(c) and 0 <= c <= 1 for c in self.color),
-                "three numbers from 0 to 1",
+                isinstance(self.color, (tuple, list))
+                and len(self.color) == 3
+                and all(_is_number(c) and 0 <= c <= 1 for c in self.color),
+                "three numbers from 0 to 1, as a tuple",
             ),
             "joints": (
                 0 < len(set(self.joints)) == len(self.joints) and all(_is_whole(j, N_JOINTS - 1) for j in self.joints),

@@ -12,6 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from refu_core._warp import as_warp
+from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, as_points, check_faces, grouped
 from refu_core.metrics._intersect_kernels import intersect_kernel
 from refu_core.sdf import ExactSdf, Winding
@@ -96,9 +97,9 @@ class SheetChecker:
 
     def with_itself(self) -> NDArray[np.int32]:
         """The pairs of its faces that intersect, shape (K, 2); meeting at a shared edge or vertex doesn't count."""
-        points = self._points.numpy()
+        tree, points = self._tree(), self._points.numpy()
         self._triangles = self._triangles or Triangles(self.faces, points)
-        return crossings(self._mesh.id, points, self._triangles, is_body=True).pairs
+        return crossings(tree, points, self._triangles, is_body=True).pairs
 
     def with_other(self, vertices: Any, faces: Any) -> NDArray[np.int32]:
         """Intersecting pairs (other's face, own face), shape (K, 2), with a garment of `vertices` and `faces`.
@@ -107,7 +108,13 @@ class SheetChecker:
         """
         other = as_vertices("the other garment's vertices", vertices)
         triangles = Triangles(check_faces(faces, n_vertices=len(other)), other)
-        return crossings(self._mesh.id, other, triangles).pairs
+        return crossings(self._tree(), other, triangles).pairs
+
+    def _tree(self) -> int:
+        """Warp's number of the garment's mesh. Raises `MeshError` before `update`."""
+        if self._mesh is None:
+            raise MeshError("no garment yet: call update(vertices) before asking what it cuts")
+        return int(self._mesh.id)
 
 
 @dataclass(frozen=True, eq=False)

@@ -199,7 +199,7 @@ _LARGEST = 1e12
 def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor that tracks gradients
         array = np.full(0, np.nan)
     if array.shape not in shapes or not np.isfinite(array).all():
         wanted, got = " or ".join(map(str, shapes)), array.shape if array.size else type(value).__name__

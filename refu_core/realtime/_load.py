@@ -65,7 +65,7 @@ def _templates(
     names = [template.name for template in loaded]
     if len(set(names)) < len(names):
         raise GarmentError(f"wanted garments of different names, got {', '.join(names)}: a person wears each once")
-    return {template.name: template.to(device=device) for template in loaded}
+    return {template.name: template.to(device=device, dtype=torch.float32) for template in loaded}
 
 
 def _cut_for(templates: Mapping[str, GarmentTemplate]) -> str:

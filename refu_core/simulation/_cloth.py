@@ -36,11 +36,13 @@ class ClothTopology:
 
     @staticmethod
     def of(mesh: Connectivity) -> ClothTopology:
-        """The topology of a garment. Raises `MeshError` when an edge has more than two faces."""
+        """The topology of a garment. Raises `MeshError` for edges of more than two faces and vertices of none."""
         opposite = mesh.faces[:, [2, 0, 1]].reshape(-1)
         count = mesh.n_faces_of_edge
         if count.max(initial=0) > 2:
             raise MeshError(f"a garment's edges need one or two faces, got {count.max()} on one edge: clean the mesh")
+        if n_unused := mesh.n_vertices - len(np.unique(mesh.faces)):  # they would fall for ever
+            raise MeshError(f"{n_unused} of a garment's vertices belong to no face: leave them out")
         by_edge = opposite[np.argsort(mesh.edge_of_corner.ravel(), kind="stable")]
         first = np.concatenate(([0], np.cumsum(count)))[:-1]
         inner = count == 2

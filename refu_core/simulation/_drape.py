@@ -17,6 +17,7 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from refu_core.body import DEFAULT_GAP, Collider, ColliderSettings, SmplBody
+from refu_core.errors import MeshError
 from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
@@ -185,7 +186,8 @@ class Draper:
     ) -> None:
         """Prepares for `garment`, or several that are worn together, on `body`, all on the CPU.
 
-        Raises `MeshError` when the body isn't watertight or an edge of a garment doesn't have one or two faces.
+        Raises `MeshError` when the body isn't watertight, a garment has edges of more than two faces or vertices of
+        none, or one that is held at the waist is closed.
         """
         self.outfit = garment if isinstance(garment, JoinedGarments) else JoinedGarments([garment])
         self.garment = garment = self.outfit.joined
@@ -212,6 +214,8 @@ class Draper:
             if garment.card.held_at_waist:
                 part = self.outfit.parts[garment.name]
                 rims = [rim for rim in loops if part.start <= rim[0] < part.stop]
+                if not rims:
+                    raise MeshError(f"{garment.name} is held at the waist, and its mesh is closed: open it there")
                 loop = max(rims, key=lambda rim: float(vertices[rim, 1].mean()))
                 found.append(np.flatnonzero(self.topology.distance_from(vertices, loop) < self.settings.waistband))
         return np.concatenate(found)

@@ -82,7 +82,7 @@ def train_beyond(
     settings = settings or BeyondSettings()
     torch_device = start_parallel(device)
     train, validation = data.split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
-    train = train.joined(data.mirrored(train, data.Mirror.of(template)))
+    train = data.with_mirrored(train, data.Mirror.of(template))
     owed = [one.displacement - data.displacements(known, one) for one in (train, validation)]
     # With both signs the mean is zero, so that nothing can be added.
     mean, components = data.principal_components(torch.cat((owed[0], -owed[0])), rank=settings.rank)

@@ -153,7 +153,7 @@ def carry_over(
     template, body = opened.garment, opened.body
     test = data.read_samples(opened.rows, body, template, split="test")
     carried = Carried(load_garment(like), template, body, settings)
-    samples = opened.samples.joined(data.mirrored(opened.samples, data.Mirror.of(template)))
+    samples = data.with_mirrored(opened.samples, data.Mirror.of(template))
     controls = nets.Controls.spread(template, settings.controls)
     here = carried(samples.betas, samples.pose)
     share = _borne_out(here, samples.displacement, controls)[:, None]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from refu_core.backbones import Backbone, BasisDecoder, TailorNet, backbone_from_weights, style_shape
 from refu_core.body import MIRRORED_JOINTS, Collider, SmplBody, load_body
-from refu_core.errors import GarmentError, RefuError
+from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate, SkinBelow, load_garment
 from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, dequantise, open_dataset
@@ -68,14 +68,11 @@ class Mirror:
     image: SurfaceMixture
 
     @staticmethod
-    def of(garment: GarmentTemplate) -> Mirror:
-        """The mirror image of a garment. Raises `GarmentError` where it isn't symmetric."""
+    def of(garment: GarmentTemplate) -> Mirror | None:
+        """The mirror image of a garment; None for one that isn't symmetric."""
         mirrored = garment.v_template.cpu().double().numpy() * np.array((-1.0, 1.0, 1.0))
         image, _, distance = SurfaceMixture.nearest(garment, mirrored)
-        if distance.max() > MAX_ASYMMETRY:
-            msg = f"{garment.name} is off its mirror image by {1e3 * distance.max():.1f} mm; train it without mirroring"
-            raise GarmentError(msg)
-        return Mirror(image)
+        return Mirror(image) if distance.max() <= MAX_ASYMMETRY else None
 
     def displacement(self, displacement: Tensor) -> Tensor:
         """Displacements of the mirrored garment, from `displacement`; both (B, V, 3) [m]."""
@@ -256,6 +253,11 @@ def mirrored(samples: TrainingSamples, mirror: Mirror) -> TrainingSamples:
     """The mirror images of the samples."""
     turned = in_chunks(mirror.displacement, samples.displacement)
     return replace(samples, pose=mirror_pose(samples.pose), displacement=turned)
+
+
+def with_mirrored(samples: TrainingSamples, mirror: Mirror | None) -> TrainingSamples:
+    """The samples and their mirror images; without a mirror the samples alone."""
+    return samples if mirror is None else samples.joined(mirrored(samples, mirror))
 
 
 def split_validation(samples: TrainingSamples, *, share: float, seed: int) -> tuple[TrainingSamples, TrainingSamples]:

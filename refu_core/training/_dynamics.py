@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -94,9 +95,11 @@ def train_dynamics(
         torch.manual_seed(settings.loop.seed)
         dynamics = Dynamics(DynamicsConfig(still.config.joints), still)
     mirror = data.Mirror.of(template)
-    plain = _prepared(still, opened.samples, _pasts(rows, rows.train))
-    turned = _prepared(still, data.mirrored(opened.samples, mirror), _pasts(rows, rows.train, is_mirrored=True))
-    train, validation = _split(opened.samples, (plain, turned), settings)
+    prepared = [_prepared(still, opened.samples, _pasts(rows, rows.train))]
+    if mirror is not None:
+        turned = data.mirrored(opened.samples, mirror)
+        prepared.append(_prepared(still, turned, _pasts(rows, rows.train, is_mirrored=True)))
+    train, validation = _split(opened.samples, prepared, settings)
     dynamics.standardise(*train[:3], still.features.are_bounded(template))
     described = {
         **opened.identity,
@@ -151,14 +154,13 @@ def _prepared(still: TailorNet, samples: data.TrainingSamples, past: Tensor) -> 
 
 
 def _split(
-    samples: data.TrainingSamples, prepared: tuple[_Prepared, _Prepared], settings: DynamicsSettings
+    samples: data.TrainingSamples, prepared: Sequence[_Prepared], settings: DynamicsSettings
 ) -> tuple[_Prepared, _Prepared]:
     """Samples to learn from, mirrored ones included, and samples for validation."""
     which = replace(samples, displacement=torch.arange(len(samples)))  # sample numbers, to split those
     train, validation = data.split_validation(which, share=settings.validation_share, seed=settings.loop.seed)
-    plain, turned = prepared
-    to_learn = [torch.cat((a[train.displacement], b[train.displacement])) for a, b in zip(plain, turned, strict=True)]
-    return _Prepared(*to_learn), _Prepared(*(one[validation.displacement] for one in plain))
+    to_learn = [torch.cat([one[train.displacement] for one in both]) for both in zip(*prepared, strict=True)]
+    return _Prepared(*to_learn), _Prepared(*(one[validation.displacement] for one in prepared[0]))
 
 
 @torch.no_grad()

@@ -118,7 +118,7 @@ def finetune(
     stem = output / f"{backbone}-{mode}"
     train, validation = data.split_validation(samples, share=settings.validation_share, seed=settings.loop.seed)
     if settings.is_mirrored:
-        train = train.joined(data.mirrored(train, data.Mirror.of(template)))
+        train = data.with_mirrored(train, data.Mirror.of(template))
     network: nets.Network
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)

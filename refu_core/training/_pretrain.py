@@ -49,6 +49,7 @@ class PretrainSettings:
     dropout: float | None = None
     """Dropout in a tailornet's low-frequency net, half that in high-frequency nets; None for the configuration's."""
     is_mirrored: bool = True
+    """Whether mirror images are learnt from, too, if the garment is symmetric."""
     validation_share: float = 0.08
 
     @classmethod
@@ -126,8 +127,7 @@ def pretrain(
     # A rehearsing network can't stray far: with none of 500 samples held out, shorts' last weights are 0.2 mm nearer.
     held_out = 0.0 if rehearsal is not None else settings.validation_share
     train, validation = data.split_validation(samples, share=held_out, seed=settings.loop.seed)
-    if mirror is not None:
-        train = train.joined(data.mirrored(train, mirror))
+    train = data.with_mirrored(train, mirror)
     described = {**identity, "backbone": backbone, "preset": preset}
     described |= {"settings": asdict(settings), "samples": len(train)}
     mean, stored = samples.displacement.mean(0), None
@@ -178,9 +178,7 @@ def basis_of(folder: Path, opened: data.TrainingSet, mirror: data.Mirror | None,
     """The folder's basis, made if there is none."""
     if (folder / "basis.json").exists():
         return nets.load_basis(folder, opened.garment, expect=opened.identity)[0]
-    displacement = opened.samples.displacement
-    if mirror is not None:
-        displacement = torch.cat((displacement, data.mirrored(opened.samples, mirror).displacement))
+    displacement = data.with_mirrored(opened.samples, mirror).displacement
     basis = data.output_basis(displacement, rank=rank)
     if is_writer():
         nets.save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": len(opened.rows)})

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from numpy.typing import NDArray
 from outside_meshes import Wanted, cloth, placed, quads_of_a_skirt, together
 from scipy.spatial.transform import Rotation
 
-from refu_core import GarmentError, load_body, load_garment
-from refu_core.fitting import Placing, SurfaceMesh, fit_garment, read_surface
+from refu_core import FrameError, GarmentError, load_body, load_garment
+from refu_core.fitting import GarmentDetails, Placing, SurfaceMesh, fit_garment, read_surface
 from refu_core.fitting._clean import clean
 from refu_core.fitting._mesh_file import _cut_quads, _ears
 from refu_core.fitting._place import find_places
@@ -226,6 +227,12 @@ def test_meshes_that_make_no_sense_are_refused_where_they_are_made(v: Any, f: An
         SurfaceMesh(v, f)
 
 
+def test_texture_coordinates_of_other_faces_are_refused() -> None:
+    uv = UvMap(np.zeros((4, 2), np.float32), np.array([[0, 1, 2], [0, 2, 3]]))
+    with pytest.raises(GarmentError, match=r"corners must be \(1, 3\), got \(2, 3\)"):
+        SurfaceMesh(np.eye(3), [[0, 1, 2]], uv)
+
+
 @pytest.mark.parametrize(("file", "name"), [("my shirt", "my shirt"), ("garment_-x", "-x")])
 def test_what_is_saved_can_be_loaded_again(tmp_path: Path, file: str, name: str) -> None:
     with pytest.raises(GarmentError, match=f"no garment is called '{name}'"):
@@ -241,9 +248,28 @@ def test_names_and_bodies_that_garments_cannot_have() -> None:
     own = load_body("neutral")
     own.name = "SMPL_NEUTRAL"
     with pytest.raises(
-        GarmentError, match="cut for one of male, female, neutral, got the body SMPL_NEUTRAL: add it for"
+        GarmentError, match=r"cut for a built-in body \(male, female, neutral\), got another, SMPL_NEUTRAL: add it for"
     ):
         fit_garment(mesh, own, name="skirt")
+    own = load_body("male")
+    own.name = "female"
+    with pytest.raises(GarmentError, match="got another, female: add it for"):
+        fit_garment(mesh, own, name="skirt")
+
+
+def test_a_body_of_double_precision_and_a_pose_of_any_numbers_will_do() -> None:
+    skirt = load_garment("skirt-female")
+    mesh = SurfaceMesh(skirt.v_template.numpy(), skirt.faces.numpy())
+    placing = Placing(np.float32(1.0), "y", np.zeros((24, 3)), is_placed=True)
+    wanted = fit_garment(mesh, load_body("female"), name="skirt", placing=placing).template
+    placing = Placing(1.0, "y", np.zeros((24, 3)).tolist(), is_placed=True)
+    made = fit_garment(mesh, load_body("female", dtype=torch.float64), name="skirt", placing=placing).template
+    torch.testing.assert_close(made.v_template, wanted.v_template, rtol=0, atol=0)
+    details = GarmentDetails(color=np.array((0.1, 0.2, 0.3)))  # JSON has no arrays
+    with pytest.raises(GarmentError, match="three numbers from 0 to 1, as a tuple"):
+        fit_garment(mesh, load_body("female"), name="skirt", placing=placing, details=details)
+    with pytest.raises(FrameError, match=r"the mesh's pose must have the shape \(24, 3\)"):
+        Placing(pose=np.zeros((2, 24, 3)))
 
 
 @pytest.mark.parametrize(

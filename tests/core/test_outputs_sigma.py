@@ -120,6 +120,7 @@ def test_the_inputs_covariance_is_that_of_samples(pipeline: GarmentPipeline, is_
     ("given", "said"),
     [
         ({"pose_covariance": np.eye(3)}, r"pose_covariance must be finite numbers of the shape \(72, 72\) or"),
+        ({"pose_covariance": torch.eye(72, requires_grad=True)}, "pose_covariance must be finite .*, got Tensor"),
         ({"pose_covariance": -np.eye(72)}, "negative variance"),
         ({"transl_covariance": np.full((3, 3), np.nan)}, "transl_covariance must be finite"),
         ({"transl_covariance": "wide"}, "transl_covariance must be finite numbers"),

@@ -48,6 +48,15 @@ def pipeline(request: pytest.FixtureRequest) -> GarmentPipeline:
     return GarmentPipeline.load(["tshirt-male", "short-pant-male"], backbone=backbone, sdf=sdf)
 
 
+def test_garments_and_bodies_of_double_precision_are_worn() -> None:
+    exact = load_garment("short-pant-male", dtype=torch.float64), load_body("neutral", dtype=torch.float64)
+    outputs = [
+        GarmentPipeline.load([garment], body=body, sdf="none")(frame())["short-pant-male"].local
+        for garment, body in (("short-pant-male", "neutral"), exact)
+    ]
+    np.testing.assert_array_equal(*outputs)
+
+
 def test_what_comes_out(pipeline: GarmentPipeline) -> None:
     out = pipeline(frame(transl=(1, 2, 3)))
     assert list(out) == ["tshirt-male", "short-pant-male"]

@@ -16,6 +16,7 @@ import torch
 import refu_core
 from refu_core import ExactSdf, GarmentPipeline, PoseHistory, RefuError, Resolver, SmplFrame, load_body
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint_layout
+from refu_core.metrics import SheetChecker
 from refu_core.outputs import PinholeCamera
 from refu_core.refu import Refu, repulse
 from refu_core.sdf import SdfSample
@@ -115,6 +116,9 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
         (lambda: Refu(3, least=1.0, margin="4 mm"), "wanted a margin in metres, got str"),
         (lambda: Refu(3, least=1.0)(torch.zeros(1, 3, 3), 5), "wanted an SdfSample.*, got int"),
         (lambda: pipeline().adjusted(FRAME, 3), "wanted a function of a Dressed, got int"),
+        (lambda: pipeline().adjusted(FRAME, lambda _: None), "wanted a Dressed from what adjusts it, got NoneType"),
+        (lambda: SheetChecker([[0, 1, 2]]).with_itself(), r"no garment yet: call update\(vertices\)"),
+        (lambda: SheetChecker([[0, 1, 2]]).with_other(CORNERS, [[0, 1, 2]]), "no garment yet"),
         (lambda: PoseHistory()(FRAME, []), "wanted a person's name, got list"),
         (lambda: KeypointTracker(skeleton()).update("x", 0), "wanted 17 keypoints of coco17 as numbers: "),
         (lambda: KeypointTracker(skeleton()).update(np.zeros((17, 3)), "now"), "whole number of nanoseconds, got str"),

@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, partial
 from multiprocessing import forkserver
 from pathlib import Path
@@ -30,8 +30,9 @@ from scipy.spatial.transform import Rotation
 import refu_core
 from refu_core._engine import Engine
 from refu_core.body import Collider, SmplBody, load_body
-from refu_core.errors import BodyError
+from refu_core.errors import BodyError, MeshError
 from refu_core.garments import load_garment
+from refu_core.mesh import Connectivity
 from refu_core.metrics import CollisionChecker, SheetChecker
 from refu_core.simulation import (
     POSTURES,
@@ -50,6 +51,7 @@ from refu_core.simulation import (
     split_clips,
     summarise,
 )
+from refu_core.simulation._cloth import ClothTopology
 from refu_core.simulation._drape import CANONICAL_POSE, COMFORT_POSES
 from refu_core.simulation._plan import TEST, TRAIN
 from refu_core.simulation._store import CAUSES, DONE, FORMAT, QUANTUM, TO_DO, Rows, dequantise, locked, quantise
@@ -160,6 +162,18 @@ def test_a_hanging_arm_stays_where_it_is() -> None:
     assert checker.check(drape.vertices, garment.faces).is_free
     checker.update(skin)
     assert checker.check(drape.vertices, garment.faces).n_inside > 20
+
+
+def test_a_closed_mesh_has_no_waistband() -> None:
+    skirt, body = load_garment("skirt-female"), load_body("female")
+    closed = replace(skirt, faces=body.faces, weights=body.weights, v_template=body.v_template)
+    with pytest.raises(MeshError, match="skirt-female is held at the waist, and its mesh is closed"):
+        Draper(closed, body)
+
+
+def test_vertices_of_no_face_are_refused() -> None:
+    with pytest.raises(MeshError, match="1 of a garment's vertices belong to no face: leave them out"):
+        ClothTopology.of(Connectivity.of([[0, 1, 2]], 4))
 
 
 def test_cloth_stretches_little(samples: list[GarmentSample]) -> None:
