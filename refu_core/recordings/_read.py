@@ -168,13 +168,13 @@ def _recording(
     hertz = rate()
     tell_pace(transl, hertz, notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
-        poses = poses.astype(np.float32)
-    bad = not_finite(poses, transl)
+        sent = poses.astype(np.float32)
+    bad = not_finite(sent, transl)
     if len(bad):
         where = f"{len(bad)} of {len(poses)}, first in number {bad[0]}"
         notes.append(f"NaN or infinite in {where}: nobody is dressed there")
     gender = gender_of(word_of(content, first(above, table.GENDERS), which), notes)
-    return Recording(poses, transl, betas, hertz, gender, tuple(notes))
+    return Recording(sent, transl, betas, hertz, gender, tuple(notes))
 
 
 def _by_time(array: NDArray[Any]) -> NDArray[Any]:
