@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from refu_core._collector import collect_rarely, keep_what_is_loaded
+from refu_core._files import keep_streams
 
 EXIT_BAD_INPUT = 2
 _LOOK_UP_S = 0.25
@@ -31,10 +32,7 @@ def run(
     live: Callable[[], int],
 ) -> int:
     """Answers --help with a `listing` of parameters and topics, or starts rclpy and runs `live`; returns the status."""
-    for number, name in ((1, "stdout"), (2, "stderr")):
-        if getattr(sys, name) is None:  # closed: what is logged would go into the next file that is opened, a bag even
-            os.dup2(os.open(os.devnull, os.O_RDWR), number)
-            setattr(sys, name, os.fdopen(number, "w"))
+    keep_streams()
     _on_signals(signal.SIG_DFL)  # while it loads, nothing is open that would have to be closed
     collect_rarely()
     try:
