@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.bags import iter_smpl_frames
 from msg_adapters.cdr import NS_PER_S
 from msg_adapters.errors import BagError, MotionFileError
-from msg_adapters.people import Track
+from msg_adapters.people import Track, check_plausible
 from refu_core.frames import SmplFrame
 from refu_core.keypoints import Proportions
 from refu_core.recordings import SUFFIXES, Axes, Recording, interpolated, n_resampled, not_finite, read_recording
@@ -38,10 +38,12 @@ class Motion(Recording):
     def frame(self, index: int) -> SmplFrame:
         """Frame `index`, stamped from 0 on.
 
-        Raises `FrameError` (of `refu_core`) when its values aren't finite: recordings do have such frames.
+        Raises `FrameError` (of `refu_core`) for numbers that aren't finite, or that no body has: recordings have them.
         """
         stamp_ns = round(index * NS_PER_S / self.fps)
-        return SmplFrame(self.poses[index], betas=self.betas, transl=self.transl[index], stamp_ns=stamp_ns)
+        frame = SmplFrame(self.poses[index], betas=self.betas, transl=self.transl[index], stamp_ns=stamp_ns)
+        check_plausible(frame)  # messages may be of float32, in which the largest would be infinite
+        return frame
 
     def frames(self) -> Iterator[SmplFrame]:
         """All frames in order; raises as `frame` does."""

@@ -12,6 +12,7 @@ import json
 import math
 import os
 import stat
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,17 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
+
+
+def keep_streams() -> None:
+    """Has standard output and error lead nowhere if they are closed, at the start of a program.
+
+    Else the next file that is opened, a bag perhaps, would get their number, and whatever is written to them.
+    """
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, os.fdopen(number, "w"))
 
 
 class _Sized(io.FileIO):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -39,7 +40,8 @@ def _start_quietly() -> None:
         wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     else:  # releases before the logger
         wp.config.quiet = True
-    with warnings.catch_warnings(), contextlib.nullcontext() if torch.cuda.is_available() else _no_stderr():
+    is_silent = torch.cuda.is_available() or sys.stderr is None
+    with warnings.catch_warnings(), contextlib.nullcontext() if is_silent else _no_stderr():
         warnings.filterwarnings("ignore", "Support for Python", FutureWarning)  # from future releases: pip sees to that
         try:
             wp.init()

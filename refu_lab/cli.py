@@ -17,6 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy reads it; more threa
 
 from refu_core import RefuError, __version__
 from refu_core._collector import collect_rarely
+from refu_core._files import keep_streams
 from refu_core.errors import printable
 from refu_lab.commands import COMMANDS, _common
 from refu_lab.interrupts import handled, interruptible
@@ -35,6 +36,7 @@ def _parser() -> _common.Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
+    keep_streams()
     collect_rarely()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal or file that has no → gets a ?

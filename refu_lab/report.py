@@ -57,7 +57,7 @@ def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) 
         frames, turned = _draw_frames(result, folder, progress=progress)
         page = folder / "index.html"
         with replacing(page) as file:
-            file.write(_page(result, frames, turned).encode())
+            file.write(_page(result, frames, turned).encode(errors="backslashreplace"))
     except OSError as error:
         raise RefuError(f"{folder}: the report can't be written: {error.strerror or error}") from error
     return page

@@ -11,7 +11,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from refu_core._files import replacing
-from refu_core.errors import RefuError
+from refu_core.errors import RefuError, printable
 
 if TYPE_CHECKING:
     from refu_lab.replay import ReplayResult
@@ -114,7 +114,7 @@ def replay_table(result: ReplayResult) -> str:
         moved = "skin moved to be free of itself: {mean:.2f} mm on average, {largest:.1f} mm at most"
         lines.append(moved.format(**result.skin_shift_mm()))
     lines += [f"skipped {count} x {reason}" for reason, count in result.skips.most_common()]
-    lines += [f"warning: {text}" for text in result.warnings]
+    lines += [printable(f"warning: {text}") for text in result.warnings]
     if result.interrupted:
         lines.append("interrupted: the figures are those of the frames so far")
     if result.options.output is not None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from refu_core._collector import collect_rarely, keep_what_is_loaded
+from refu_core._files import keep_streams
 
 EXIT_BAD_INPUT = 2
 _LOOK_UP_S = 0.25
@@ -31,6 +32,7 @@ def run(
     live: Callable[[], int],
 ) -> int:
     """Answers --help with a `listing` of parameters and topics, or starts rclpy and runs `live`; returns the status."""
+    keep_streams()
     _on_signals(signal.SIG_DFL)  # while it loads, nothing is open that would have to be closed
     collect_rarely()
     try:

@@ -16,6 +16,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import INPUT_TYPES, SMPL_TOPIC, WORLD_FRAME, Encoder, encoder_for, load_motion
 from refu_core import FrameError
+from refu_core.errors import printable
 from refu_core.options import check, fixed
 from refu_core.recordings import Axes
 from refu_ros._guard import GuardedNode
@@ -59,7 +60,7 @@ class SmplPublisher(GuardedNode):
         axes: Axes = "frame" if self.options.input_axes == "frame" else "auto"
         motion = load_motion(self.options.motion, axes=axes, fps=self.options.fps)
         for note in motion.notes:
-            self.get_logger().warning(f"{self.options.motion}: {note}")
+            self.get_logger().warning(printable(f"{self.options.motion}: {note}"))
         if self.options.in_place:
             motion = motion.in_place(up=1 if self.options.input_axes == "smpl" else 2)
         if self.options.rate not in (0, motion.fps):

@@ -247,6 +247,17 @@ def test_whose_reader_has_gone_ends_quietly(arguments: list[str], *, buffered: b
     assert (done.returncode in (0, _common.EXIT_UNREAD), done.stderr) == (True, b"")
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [["-c", "import refu_core._warp"], ["-m", "refu_lab", "export", "bags/walk", "--output={}"]],
+    ids=["library", "command"],
+)
+def test_without_standard_streams_it_works_as_with_them(arguments: list[str], tmp_path: Path) -> None:
+    command = [sys.executable, *(one.format(tmp_path / "a.glb") for one in arguments)]
+    closed = ["sh", "-c", 'exec "$@" >&- 2>&-', "sh", *command]
+    assert subprocess.run(closed, cwd=Path(__file__).parents[1], check=False).returncode == 0
+
+
 def test_output_that_cannot_be_written_is_one_line() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     with Path("/dev/full").open("w") as full:

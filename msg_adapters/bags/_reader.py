@@ -158,4 +158,4 @@ class BagReader:
 
 def _by_number(path: Path) -> list[Any]:
     """Orders bag_2.mcap before bag_10.mcap, as they were recorded."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]

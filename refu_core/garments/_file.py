@@ -25,11 +25,16 @@ _BUILTIN = Path(__file__).parents[1] / "assets"
 
 
 def garments_folder() -> Path:
-    """The user's garments: $REFU_GARMENTS, or refu/garments in $XDG_DATA_HOME (~/.local/share); it may not exist."""
-    if os.environ.get("REFU_GARMENTS"):
-        return Path(os.environ["REFU_GARMENTS"]).expanduser()
-    shared = os.environ.get("XDG_DATA_HOME")
-    return (Path(shared) if shared else Path("~/.local/share").expanduser()) / "refu" / "garments"
+    """The user's garments: $REFU_GARMENTS, or refu/garments in $XDG_DATA_HOME (~/.local/share); it may not exist.
+
+    Raises `GarmentError` for a user without a home, who has set neither.
+    """
+    own, shared = os.environ.get("REFU_GARMENTS"), os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+    try:
+        return (Path(own) if own else Path(shared, "refu", "garments")).expanduser()
+    except RuntimeError as error:
+        msg = f"{own or shared}: there is no such home; set REFU_GARMENTS to a folder for your own garments"
+        raise GarmentError(msg) from error
 
 
 def garment_files() -> dict[str, Path]:
@@ -37,7 +42,7 @@ def garment_files() -> dict[str, Path]:
     found = {name: _BUILTIN / GARMENT_FILE.format(name) for name in BUILTIN_GARMENTS}
     try:
         own = sorted(garments_folder().glob("*.npz"))
-    except (OSError, RuntimeError):  # no home or no permission: no garments of the user's
+    except (OSError, GarmentError):  # no home or no permission: no garments of the user's
         own = []
     for path in own:
         found.setdefault(_name_in(path), path)

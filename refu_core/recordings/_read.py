@@ -136,7 +136,9 @@ def _recording(
     transl = transl_of(one(layout.transl), layout, n, notes)
     scaling = one(table.SCALINGS)
     if scaling is not None:
-        transl = transl / float(scaling.reshape(-1)[0])
+        if scaling.dtype.kind not in "iuf" or not scaling.size or not 1e-6 <= scaling.flat[0] <= 1e6:
+            raise ValueError(f"{table.SCALINGS[0]} must be a number in [1e-6, 1e6], got {scaling.reshape(-1)[:1]}")
+        transl = transl / scaling.flat[0]
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
     is_smplx = (
         any("smplx" in table.spelled(key) for key in like)
@@ -162,17 +164,17 @@ def _recording(
     usual: Axes = "z-up" if of_amass else "smpl"
     roots, transl = to_smpl(roots, transl, axes, notes, usual=usual, pelvis=pelvis)
     if axes != "frame":
-        with np.errstate(over="ignore", invalid="ignore"):
-            poses[:, 0] = roots
+        poses[:, 0] = roots
     hertz = rate()
     tell_pace(transl, hertz, notes)
-    bad = not_finite(poses, transl)
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
+        sent = poses.astype(np.float32)
+    bad = not_finite(sent, transl)
     if len(bad):
         where = f"{len(bad)} of {len(poses)}, first in number {bad[0]}"
         notes.append(f"NaN or infinite in {where}: nobody is dressed there")
     gender = gender_of(word_of(content, first(above, table.GENDERS), which), notes)
-    with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses
-        return Recording(poses.astype(np.float32), transl, betas, hertz, gender, tuple(notes))
+    return Recording(sent, transl, betas, hertz, gender, tuple(notes))
 
 
 def _by_time(array: NDArray[Any]) -> NDArray[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from refu_core.errors import printable
 from refu_lab.commands import _common as cli
 from refu_lab.commands.replay import RecordingOptions
 
@@ -37,5 +38,5 @@ def run(args: argparse.Namespace) -> int:
     what = {"first": args.first, "count": args.count, "with_body": args.with_body, "overwrite": args.overwrite}
     written, warnings = export(options, args.output, **what)
     lines = [f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in written]
-    lines += [f"warning: {warning}" for warning in warnings]
+    lines += [printable(f"warning: {warning}") for warning in warnings]
     return cli.tell(args, "\n".join(lines), {"files": [str(path) for path in written], "warnings": warnings})

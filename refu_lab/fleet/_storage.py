@@ -103,7 +103,7 @@ class Folder:
     def put_text(self, text: str, name: str) -> None:
         with self.scratch() as folder:
             file = folder / "text"
-            file.write_text(text, encoding="utf-8")
+            file.write_text(text, encoding="utf-8", errors="backslashreplace")
             self.put(file, name)
 
     def read_json(self, name: str) -> Any:

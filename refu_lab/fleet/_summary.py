@@ -91,8 +91,8 @@ class FleetResult:
         return html_page(f"{REPLAY_TITLE}{len(self.rows)} recordings", body, style=STYLE)
 
     def _link(self, row: Mapping[str, Any]) -> str:
-        text = html.escape(row["name"])
-        return text if "error" in row else f'<a href="{quote(row["name"])}/index.html">{text}</a>'
+        text, place = html.escape(row["name"]), quote(row["name"], errors="surrogateescape")  # a name may be no text
+        return text if "error" in row else f'<a href="{place}/index.html">{text}</a>'
 
 
 def fleet_table(result: FleetResult) -> str:

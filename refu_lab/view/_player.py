@@ -47,7 +47,7 @@ class Player:
         picked = np.unique(np.linspace(0, len(self._times) - 1, _GROUND_FRAMES).astype(int))
         lowest = [float(shape.vertices[:, 2].min()) for i in picked for shape in film.shapes(int(i))]
         first = film.shapes(0)
-        self._stage.set(first, ground=min(lowest), front=film.front)
+        self._stage.set(first, ground=min(lowest, default=0.0), front=film.front)
         self._build(first)
         self._show(0)
         if isinstance(film, LiveFilm):

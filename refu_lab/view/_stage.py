@@ -22,6 +22,8 @@ _FOV = 30.0
 """Vertical field of view [degrees]: a long lens, so that proportions look natural."""
 _SIDE = 0.45
 """Angle between the first view and the person's front [rad]: a little from the side."""
+_NOBODY = np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.8]])
+"""What is looked at if nothing is there: whoever was seen may leave before the viewer begins [m]."""
 _SKY, _EARTH, _SUN = (236, 242, 255), (176, 166, 156), (255, 244, 228)
 _GROUND, _LINES, _SECTIONS = (238, 239, 241), (214, 217, 222), (190, 195, 203)
 
@@ -56,7 +58,7 @@ class Stage:
 
         `ground` is its height [m]; `front` is where the person faces, from x towards y [rad].
         """
-        points = np.concatenate([shape.vertices for shape in shapes]).astype(np.float64)
+        points = np.concatenate([shape.vertices for shape in shapes] or [_NOBODY]).astype(np.float64)
         centre = (points.min(0) + points.max(0)) / 2
         self._server.scene.add_grid(
             "/world/ground",

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from refu_core import RefuError
 from refu_core._device import one_thread
+from refu_core.errors import printable
 from refu_core.recordings import SUFFIXES
 from refu_lab.commands.view import ViewOptions
 from refu_lab.view._dressed import DressedFilm
@@ -47,7 +48,7 @@ def view(
         if not isinstance(film, DressedFilm):
             opened.callback(film.close)
         for note in film.notes:
-            say(f"warning: {note}")
+            say(printable(f"warning: {note}"))
         server = _serve(options)
         opened.callback(_stop, server)
         try:

@@ -439,6 +439,7 @@ def test_a_directory_whose_recording_was_interrupted(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag", chunk_bytes=4096)
     (tmp_path / "bag" / "metadata.yaml").unlink()
     path.write_bytes(path.read_bytes()[:3000])
+    path.rename(path.with_name("²1.mcap"))  # ² is a digit, and no number
     bag = open_smpl_bag(tmp_path / "bag")
     assert 0 < len(list(bag)) < 40
     assert "was the recording interrupted?" in bag.reader.warnings[0]

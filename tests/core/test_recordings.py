@@ -155,6 +155,8 @@ def test_any_rotation_comes_back(seed: int, size: int) -> None:
         ({"poses": POSES, "betas": np.zeros((4, 10))}, "betas must be one row of .*, or a row for each of 30"),
         ({"verts": np.zeros((T, 9, 3))}, "no poses; wanted pose_world, .*; the file has"),
         ({"mhr_model_params": np.zeros((T, 204))}, "MHR .* aren't read: save pred_keypoints_3d"),
+        ({"smpl_poses": POSES, "smpl_scaling": []}, "smpl_scaling must be a number in .*, got"),
+        ({"smpl_poses": POSES, "smpl_trans": TRANSL, "smpl_scaling": [0.0]}, "smpl_scaling must be a number in"),
     ],
 )  # fmt: skip
 def test_what_is_refused_says_what_to_do(tmp_path: Path, arrays: dict[str, Any], said: str) -> None:

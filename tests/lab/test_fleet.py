@@ -218,6 +218,16 @@ def test_page_over_all_leads_to_each_report(bags: Path, tmp_path: Path) -> None:
     assert not list((tmp_path / "report").rglob(".lock"))
 
 
+@pytest.mark.usefixtures("little_light")
+def test_a_name_that_is_no_text_takes_the_report_from_nobody(bags: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"w\xff.mcap")
+    odd.write_bytes((bags / "b" / "walk.mcap").read_bytes())
+    assert run(odd, bags / "a" / "walk.mcap", "--report", tmp_path / "report") == 0
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert 'w%FF/index.html"' in page
+    assert "w\\udcff" in page
+
+
 def test_what_is_finished_is_not_done_again(bags: Path, alone: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out"
     shutil.copytree(alone, out)

@@ -370,3 +370,17 @@ def test_damaged_meshes_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "a.glb").write_bytes(b"glTF" + bytes(40))
     with pytest.raises(GarmentError, match="not a mesh that can be read"):
         read_surface(tmp_path / "a.glb")
+
+
+def test_who_has_no_home_is_told_what_to_set(
+    kilt: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("REFU_GARMENTS", "~nobody.of.this.name/garments")
+    for command in (["list"], ["add", str(kilt), "--body", "female"]):
+        assert main(["garment", *command]) == 2
+        assert (
+            "error: ~nobody.of.this.name/garments: there is no such home; set REFU_GARMENTS" in capsys.readouterr().err
+        )
+    assert "tshirt-male" in garment_files()

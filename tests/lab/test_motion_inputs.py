@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
@@ -25,6 +26,7 @@ from refu_lab.replay import ReplayResult, replay
 from refu_lab.report import write_report
 
 ROOT = Path(__file__).parents[2]
+FAST = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider", "--quiet"]
 Z_UP = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
 PLAIN: dict[str, Any] = {"garments": ("short-pant-male",), "backbone": "skinned", "sdf": "none", "collider": False}
 FRAMES = [*islice((one.frame for one in adapters.iter_smpl_frames(ROOT / "bags" / "walk") if one.frame), 8)]
@@ -52,12 +54,30 @@ def heights(result: ReplayResult) -> tuple[float, float]:
     return float(joints[15, 1]), float(joints[15, 2])
 
 
-def test_frames_that_are_not_finite_are_told(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [np.nan, 1e300])  # float32, in which poses are, ends at 3e38
+def test_frames_that_are_not_finite_are_told(tmp_path: Path, number: float) -> None:
     poses = np.zeros((10, 72))
-    poses[3] = np.nan
+    poses[3] = number
     np.savez(tmp_path / "a.npz", poses=poses, trans=np.zeros((10, 3)), betas=np.zeros(10), mocap_framerate=30)
     motion = adapters.read_motion(tmp_path / "a.npz", axes="smpl")
     assert "NaN or infinite in 1 of 10, first in number 3: nobody is dressed there" in motion.notes
+
+
+def test_names_of_people_are_no_commands_to_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    people = {name: {"poses": np.zeros((n, 72)), "fps": 30} for name, n in (("\x1b[2Jann", 3), ("bob", 2))}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(people))
+    assert main(["replay", str(tmp_path / "a.pkl"), *FAST]) == 0
+    printed = capsys.readouterr().out
+    assert "\\x1b[2Jann (3 frames)" in printed
+    assert printed.replace("\n", "").isprintable()
+
+
+def test_numbers_beyond_those_of_messages_are_refused_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    np.savez(tmp_path / "a.npz", poses=np.zeros((3, 72)), trans=np.full((3, 3), 1e300), fps=30)
+    assert main(["replay", str(tmp_path / "a.npz"), *FAST]) == 2
+    assert "3 x transl: wanted magnitudes up to 1e+09, got 1e+300" in capsys.readouterr().err
 
 
 def test_z_up_is_seen_and_pictures_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

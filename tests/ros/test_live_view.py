@@ -27,6 +27,7 @@ from refu_lab.commands.replay import RecordingOptions
 from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
 from refu_lab.view._live import LiveFilm
+from refu_lab.view._player import Player
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -99,6 +100,21 @@ def test_a_film_shows_what_is_published_and_not_who_has_left(node: Node) -> None
         )
         node.until(lambda: not film.shapes(0), node.leave)
     finally:
+        film.close()
+
+
+def test_who_leaves_before_the_viewer_begins_does_not_end_it(node: Node) -> None:
+    viser = pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    film, server = LiveFilm(["garments"]), viser.ViserServer(host="localhost", verbose=False)
+    try:
+        node.until(lambda: bool(film.shapes(0)), lambda: node.send(0.0, 10**9))
+        node.until(lambda: not film.shapes(0), node.leave)
+        player = Player(server, film)
+        node.until(lambda: bool(film.shapes(0)), lambda: node.send(0.0, 2 * 10**9))
+        player.run(until=iter([False, True]).__next__)
+        assert ("", "tshirt-male", 0) in player._stage._drawn
+    finally:
+        server.stop()
         film.close()
 
 

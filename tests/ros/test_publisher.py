@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -206,6 +208,15 @@ def test_bad_parameters_are_one_line(tmp_path: Path) -> None:
     assert start(tmp_path / "log.txt", motion="nowhere").wait(PATIENCE_S) == 2
     (line,) = (tmp_path / "log.txt").read_text().splitlines()
     assert line.startswith("smpl_publisher: error: nowhere: can't be read: No such file or directory; wanted")
+
+
+def test_without_standard_streams_it_runs_as_with_them() -> None:
+    """As daemons are started: the executor refused to begin, and to say so failed."""
+    isolate()
+    given = ros_arguments({"loop": False, "rate": 240})
+    command = [sys.executable, "-m", "refu_ros.smpl_publisher", *given]
+    closed = ["sh", "-c", 'exec "$@" >&- 2>&-', "sh", *command]
+    assert subprocess.run(closed, cwd=BAGS.parent, check=False, timeout=PATIENCE_S).returncode == 0
 
 
 def publisher(context: Context, **parameters: Any) -> SmplPublisher:
