@@ -98,8 +98,9 @@ class Anatomy:
         self.bones = self._bind_bones(rest, mesh, weights)
         self.seams = self._bind_seams(body)
         self.segments = self._bind_segments(rest, solids, weights)
-        thickness = _thickness(rest, mesh, str(self.device))
-        self.farthest = torch.as_tensor(thickness, device=self.device).mul(settings.thin).clamp(max=settings.farthest)
+        self.thickness = torch.as_tensor(_thickness(rest, mesh, str(self.device)), device=self.device)
+        """How far it is through the body from each vertex [m], shape (V,)."""
+        self.farthest = self.thickness.mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
         self.aside = Aside(body, mesh, farthest=settings.aside_farthest, rounds=settings.aside_rounds)
         """Brings arms out of the rest of the body."""

@@ -57,6 +57,10 @@ class SkinBelow:
         best, which = score.topk(N_BELOW, 1)
         return cls(torch.cat(vertex, 1).gather(1, which).int().to(body.device), best.softmax(1).to(body.v_template))
 
+    def mean(self, values: Tensor) -> Tensor:
+        """The mean below each vertex of the cloth, shape (N,), of `values` of the skin's vertices (V,)."""
+        return (values[self.vertex.long()] * self.weight).sum(1)
+
     def __call__(self, shift: Tensor) -> Tensor:
         """How far cloth moves [m], shape (B, N, 3), with skin that moves by `shift` (B, V, 3). Differentiable."""
         if is_plain(shift, self.weight):

@@ -77,7 +77,11 @@ class ContactStage:
         """Whether a collider makes room for cloth beside limbs."""
         if outfit.collider is not None:
             self._limbs = LimbMeshes(body)
-            self._own_side = {name: OwnSide(one.mesh, body.device, settings=settings) for name, one in garments.items()}
+            thickness = outfit.collider.anatomy.thickness
+            self._own_side = {
+                name: OwnSide(one.mesh, body.device, thickness=outfit.below[name].mean(thickness), settings=settings)
+                for name, one in garments.items()
+            }
             self._press = {
                 name: Press(one.template, self._limbs, knows_arms=one.knows_arms, settings=settings)
                 for name, one in outfit.wearables.items()

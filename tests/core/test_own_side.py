@@ -15,6 +15,7 @@ from refu_core import GarmentPipeline, SmplFrame
 from refu_core.contact import DEFAULT_CONTACT, OwnSide
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker
+from refu_core.realtime import Dressed
 from refu_core.skeleton import JOINT_NAMES
 
 SKIRT = "skirt-female"
@@ -90,6 +91,29 @@ def test_a_skirt_on_raised_and_spread_thighs_is_not_torn(bend: float) -> None:
     assert not found.inside.any()
     assert len(found.pairs) < 20
     assert np.linalg.norm(outs[1][SKIRT].local - outs[0][SKIRT].local, axis=1).max() < 0.06
+
+
+@pytest.mark.parametrize("way", [[0.0, 0.0, 0.04], [0.04, 0.0, 0.0]])
+def test_a_sleeve_in_the_middle_of_a_forearm_is_not_torn(way: list[float]) -> None:
+    """A forearm is never 30 mm deep: the halves of a sleeve were thrown out to both sides of it."""
+    pipeline = GarmentPipeline.load(["shirt-male"])
+    shirt = pipeline.garments["shirt-male"]
+    of_forearm = shirt.weights[:, JOINT_NAMES.index("left_elbow"), None]
+
+    def moved(dressed: Dressed) -> Dressed:
+        drape = dressed.drapes["shirt-male"]
+        drape = drape._replace(vertices=drape.vertices + of_forearm * torch.tensor(way))
+        return dressed._replace(drapes={"shirt-male": drape})
+
+    pose = np.zeros((24, 3))
+    pose[16, 2], pose[17, 2] = -1.2, 1.2
+    out = pipeline.adjusted(SmplFrame(pose), moved)
+    checker = CollisionChecker(pipeline.body.faces)
+    checker.update(out.body)
+    assert checker.check(out["shirt-male"].local, shirt.faces.numpy()).is_free
+    lengths = [np.linalg.norm(points[a] - points[b], axis=1) for a, b in [shirt.mesh.edges.T]
+               for points in (out["shirt-male"].local, shirt.v_template.numpy())]  # fmt: skip
+    assert (lengths[0] / lengths[1]).max() < 2
 
 
 def test_a_heel_goes_up_behind_a_skirt() -> None:
