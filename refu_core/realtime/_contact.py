@@ -78,8 +78,8 @@ class ContactStage:
         if outfit.collider is not None:
             self._limbs = LimbMeshes(body)
             thickness = outfit.collider.anatomy.thickness
-            self._own_side = {
-                name: OwnSide(one.mesh, body.device, thickness=outfit.below[name].mean(thickness), settings=settings)
+            self.own_sides = {
+                name: OwnSide(one, outfit.below[name].mean(thickness), settings=settings)
                 for name, one in garments.items()
             }
             self._press = {
@@ -140,10 +140,10 @@ class ContactStage:
         start = self._asked[name](vertices, on_mean=on_mean, reach=reach)
         if not self._has_room:
             return vertices, start
-        share = self._own_side[name].share(start.distance)
+        share = self.own_sides[name].share(start.distance)
         if self._is_serial and not bool(share.any()):
             return vertices, start
-        vertices = self._own_side[name](vertices, share, self._skin_below(name))
+        vertices = self.own_sides[name](vertices, share, self._skin_below(name))
         return vertices, self._asked[name](vertices, on_mean=on_mean, reach=reach)
 
     def lift(

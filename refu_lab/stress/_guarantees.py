@@ -14,7 +14,7 @@ from torch import Tensor
 
 from refu_core.backbones import Skinned
 from refu_core.body import Surface
-from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT, OwnSide
+from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT
 from refu_core.frames import SmplFrame
 from refu_core.garments import inner_first
 from refu_core.mesh import face_normals
@@ -216,7 +216,7 @@ def _aims(subject: Subject, pipeline: GarmentPipeline, out: PipelineOutput) -> d
         mesh = out[name]
         raw = torch.tensor(mesh.raw)
         place, lack = _closest_skin(subject, out, raw)
-        own_side = OwnSide(pipeline.garments[name].mesh, raw.device)
+        own_side = subject.contact_stage.own_sides[name]
         share = own_side.share(subject.distances["exact"].query(raw).distance)
         if bool(share.any()):
             skin = pipeline.outfit.below[name](torch.tensor(out.body)[None])[0]
