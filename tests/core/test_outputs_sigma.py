@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,14 @@ from refu_core.outputs import RADIUS_90, UNKNOWN_SIGMA, Sigma, SigmaMap, bend_of
 from refu_lab.truth import cross_checked, held_out
 
 BAGS = Path(__file__).parents[2] / "bags"
+OWN = "top-of-mine"
 
 
 @pytest.fixture(scope="module")
 def pipeline() -> GarmentPipeline:
-    """A garment that has a σ and one that has none."""
-    return GarmentPipeline.load(["short-pant-male", "longsleeve-male"], sdf="none", collider=False)
+    """A garment that has a σ and one that has none, somebody's own."""
+    own = replace(load_garment("longsleeve-male"), name=OWN)
+    return GarmentPipeline.load(["short-pant-male", own], sdf="none", collider=False)
 
 
 @pytest.mark.parametrize("garment", ["tshirt-male", "shirt-male", "short-pant-male", "skirt-female"])
@@ -79,16 +82,16 @@ def test_what_nobody_has_measured_is_said_to_be_unknown(pipeline: GarmentPipelin
     every = Sigma(pipeline)
     assert [one.is_measured for one in every.maps.values()] == [True, False]
     found = every(frame, pipeline(frame))
-    assert (found["longsleeve-male"] == np.float32(UNKNOWN_SIGMA)).all()
+    assert (found[OWN] == np.float32(UNKNOWN_SIGMA)).all()
     assert 0.001 < found["short-pant-male"].min() < found["short-pant-male"].max() < 0.02
-    assert not load_sigma(load_garment("longsleeve-male")).is_measured
+    assert not load_sigma(pipeline.garments[OWN]).is_measured
     assert np.isfinite(SigmaMap.unknown(3).at(1.0)).all()
 
 
 @pytest.mark.parametrize("is_full", [False, True])
 def test_the_inputs_covariance_is_that_of_samples(pipeline: GarmentPipeline, is_full: bool) -> None:
     """Six hundred poses drawn from it, against one linear formula."""
-    name, rng = "longsleeve-male", np.random.default_rng(1)
+    name, rng = OWN, np.random.default_rng(1)
     pose = rng.normal(0, 0.3, (24, 3))
     frame = SmplFrame(pose=pose)
     scale = np.radians(rng.uniform(0.3, 1.5, (24, 1, 1))) * (np.eye(3) + 0.3 * rng.normal(size=(24, 3, 3)))
