@@ -25,6 +25,8 @@ from refu_core.recordings._upright import Array, Axes
 
 _MAX_BYTES = 256 << 20
 _MAX_JOINTS = 1000
+_LARGEST = 1e9
+"""A thousand kilometres in millimetres; squares of larger numbers soon overflow."""
 _CHANNELS = {f"{axis}{kind}": (kind, i) for kind in ("position", "rotation") for i, axis in enumerate("xyz")}
 _NAMES = {
     "knee": ("shin", "shank", "knee", "lowerleg", "lowleg", "calf", "tibia", "leg"),
@@ -88,6 +90,9 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
         finite = int(np.isfinite(numbers).sum())
         msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
         raise ValueError(msg)
+    given = np.concatenate((numbers, *(joint.offset for joint in joints)))
+    if not (np.abs(given) < _LARGEST).all():
+        raise ValueError(f"wanted offsets, places and angles below {_LARGEST:g}, got {np.abs(given).max():g}")
     return joints, numbers.reshape(count, n_channels), float(head[2])
 
 

@@ -459,6 +459,8 @@ def test_bvh_that_is_refused(tmp_path: Path) -> None:
     for content, said in [
         (text.replace("LeftUpLeg", "Tail"), "no l_hip among Hips"),
         (text.replace("Zrotation", "Wrotation"), "unknown channel 'wrotation'"),
+        (text.replace("OFFSET 0 0 0", "OFFSET 0 1e300 0", 1), r"below 1e\+09, got 1e\+300"),
+        (text.replace("OFFSET 0 0 0", "OFFSET nan 0 0", 1), "below 1e.09, got nan"),
         (text[: len(text) // 3], "not a BVH file"),
         (text[:-40], "finite numbers, got"),
         (text.replace("Frame Time: 0.0333333", "Frame Time: 0"), "frame rate"),
