@@ -103,13 +103,13 @@ def fit_garment(
     if details.held_at not in (None, *HOLDS):
         raise GarmentError(f"a garment is held at {' or '.join(HOLDS)}, got {details.held_at!r}")
     require_name(name)
-    # A file may be called as a built-in body.
-    if body.name not in BUILTIN_BODIES or body.fingerprint != load_body(body.name).fingerprint:
+    built_in = load_body(body.name) if body.name in BUILTIN_BODIES else None  # in float32, on the CPU
+    if built_in is None or body.fingerprint != built_in.fingerprint:  # a file may be called as a built-in body
         raise GarmentError(
             f"a garment is cut for a built-in body ({', '.join(BUILTIN_BODIES)}), got another, {body.name}: add it for "
             f"the one that is most like it; a replay or pipeline with {body.name} as its body (--body) wears it, too"
         )
-    body = load_body(body.name)  # in float32, on the CPU
+    body = built_in
     cleaned, notes = clean(mesh)
     if len(cleaned.vertices) > MAX_VERTICES:
         msg = f"it has {len(cleaned.vertices)} vertices, at most {MAX_VERTICES} are worn: decimate the mesh"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -48,6 +49,7 @@ class Proportions:
     """How a unit of each beta moves them [m], shape (24, 3, 10)."""
 
     @classmethod
+    @cache
     def builtin(cls, name: str) -> Proportions:
         """The proportions of a built-in body. Raises `BodyError`."""
         keys = ("v_template", "J_regressor", "shapedirs")

@@ -20,7 +20,7 @@ from refu_core.keypoints import Proportions
 from refu_core.recordings._followed import follow, metres_of
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps
-from refu_core.recordings._retarget import SourceSkeleton, fitted_betas, retargeted
+from refu_core.recordings._retarget import SourceSkeleton, retargeted
 from refu_core.recordings._upright import Array, Axes
 
 _MAX_BYTES = 256 << 20
@@ -180,14 +180,12 @@ def _fitted(
     lost = [name for name in _POINTS if name not in points]
     without = f"; not found by their names: {', '.join(lost)}" if lost else ""
     body = Proportions.builtin("neutral") if worn is None else worn
-    betas = fitted_betas(source, body)
-    on_body = retargeted(source, body.of(betas))
-    seen = {name: source.at(name) for name in points} if on_body is None else on_body
-    turned = "" if on_body is None else "; its trunk and head turn as these joints do"
+    on_body = retargeted(source, body)
+    betas, seen = on_body or (None, {name: source.at(name) for name in points})
+    turned = "; its trunk and head turn as these joints do" if on_body else ""
     notes.append(f"the skeleton of {len(joints)} joints is fitted by the positions of {len(points)}{without}{turned}")
     found = np.stack(list(seen.values()), axis=1)
-    known = None if on_body is None else betas
-    return follow(tuple(seen), found, fps=fps, axes=axes, usual="smpl", worn=worn, betas=known, notes=notes)
+    return follow(tuple(seen), found, fps=fps, axes=axes, usual="smpl", worn=worn, betas=betas, notes=notes)
 
 
 def _points(joints: list[_Joint], places: Array) -> dict[str, int]:

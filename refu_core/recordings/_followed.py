@@ -54,8 +54,8 @@ def follow(
 ) -> Recording:
     """The motion of a person whose `points`, named as in the keypoint layouts, are at `places` (T, K, 3) [m].
 
-    A point that isn't seen is NaN. The betas are fitted to the body `worn`, or to the neutral body if it isn't given.
-    Every assumption is added to `notes`, which go into the recording.
+    A point that isn't seen is NaN. The `betas`, if they aren't known, are fitted to the body `worn`, or to the neutral
+    body if that isn't given. Every assumption is added to `notes`, which go into the recording.
 
     Raises `ValueError` if no frame shows a person.
     """

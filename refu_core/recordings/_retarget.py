@@ -82,7 +82,7 @@ class SourceSkeleton:
         return at
 
 
-def fitted_betas(source: SourceSkeleton, body: Proportions) -> Array:
+def _fitted_betas(source: SourceSkeleton, body: Proportions) -> Array:
     """The betas, shape (10,), with which a body's bones are about as long as the skeleton's."""
     ends = [(f"{side}_{a}", f"{side}_{b}") for a, b in _BONES for side in _SIDES if f"{side}_{b}" in source.points]
     ways = [source.at(b) - source.at(a) for a, b in ends]
@@ -152,12 +152,13 @@ class _Turned:
         return cls(trunk[0], trunk[1], neck, head, chest)
 
 
-def retargeted(source: SourceSkeleton, rest: Array) -> dict[str, Array] | None:
-    """Where the points of a body with joints at `rest` (24, 3) [m] are in the skeleton's motion [m], each (T, 3).
+def retargeted(source: SourceSkeleton, body: Proportions) -> tuple[Array, dict[str, Array]] | None:
+    """Betas (10,) for a body like the skeleton, and where its points are in the skeleton's motion [m], each (T, 3).
 
     None where the turns of its joints don't say how hips and trunk are turned.
     """
-    joint = dict(zip(JOINT_NAMES, rest, strict=True))
+    betas = _fitted_betas(source, body)
+    joint = dict(zip(JOINT_NAMES, body.of(betas), strict=True))
     hips = (joint["left_hip"] + joint["right_hip"]) / 2
     turned = _Turned.of(source, joint["neck"] - hips)
     if turned is None:
@@ -183,7 +184,7 @@ def retargeted(source: SourceSkeleton, rest: Array) -> dict[str, Array] | None:
         found["head"] = found["neck"] + turned.neck @ (joint["head"] - joint["neck"])
         for name, offset in zip(_FACE, layout_of("", _FACE).offsets, strict=True):
             found[name] = found["head"] + turned.head @ offset
-    return found
+    return betas, found
 
 
 def _shoulder(source: SourceSkeleton, turned: _Turned, side: str, start: Array, collar: Array) -> Array:
@@ -224,6 +225,5 @@ def _mean_in(turns: Array, ways: Array) -> Array:
 
 def _mean_turn(turns: Array, axes: Array) -> Array:
     """The rotation (3, 3) that brings `turns` nearest to `axes`, both (T, 3, 3), on average."""
-    u, _, vh = np.linalg.svd(np.einsum("tji,tjk->ik", turns, axes))
-    turn: Array = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vh)]) @ vh
-    return turn
+    mean: Array = Rotation.from_matrix(turns.swapaxes(1, 2) @ axes).mean().as_matrix()
+    return mean

@@ -394,9 +394,11 @@ ELSEWHERE = {
     "spine1": (0.0, 0.05, 0.02),
     "neck": (0.0, -0.06, 0.03),
     "head": (0.0, 0.04, -0.03),
+    "left_shoulder": (0.02, -0.03, 0.0),
+    "right_shoulder": (-0.02, -0.03, 0.0),
+    "left_hip": (0.03, 0.0, 0.0),
+    "right_hip": (-0.03, 0.0, 0.0),
 }
-ELSEWHERE |= {"left_shoulder": (0.02, -0.03, 0.0), "right_shoulder": (-0.02, -0.03, 0.0), "left_hip": (0.03, 0.0, 0.0)}
-ELSEWHERE |= {"right_hip": (-0.03, 0.0, 0.0)}
 
 
 @pytest.mark.parametrize("along_bones", [False, True])
