@@ -17,7 +17,7 @@ from refu_core.recordings._recording import Recording
 from refu_core.recordings._upright import Axes, to_smpl
 from refu_core.skeleton import PARENTS
 
-_SETTINGS = TrackerSettings(noise=0.01, rest_after=1.0)
+_SETTINGS = TrackerSettings(noise=0.01, rest_after=1.0, shape_pull=1.0)
 _FIT = 100  # frames that a person's shape is taken from
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
 _LEG = 0.82
