@@ -113,8 +113,10 @@ def whose_joints(places: NDArray[np.float64], worn: Proportions | None) -> tuple
     """
 
     def raised(joints: NDArray[np.float64]) -> float:
-        legs = sum(np.linalg.norm(joints[:, a] - joints[:, b], axis=1) for a, b in ((1, 4), (4, 7), (2, 5), (5, 8))) / 2
-        return float(np.nanmedian(np.linalg.norm(joints[:, 0] - joints[:, 1:3].mean(axis=1), axis=1) / legs))
+        middle = joints[:, 1:3].mean(axis=1)
+        bones = [joints[:, 0] - middle, *(joints[:, a] - joints[:, b] for a, b in ((1, 4), (4, 7)))]
+        height, thigh, shank = np.nanmedian(np.linalg.norm(bones, axis=-1), axis=1)
+        return float(height / (thigh + shank))
 
     own = raised((Proportions.builtin("neutral") if worn is None else worn).joints[None])
     found = raised(places)
