@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3
-from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, SPREAD, Solution, Solver, TrackerSettings, first_pose
+from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, Solution, Solver, TrackerSettings, first_pose
 
 DEFAULTS = TrackerSettings()
 
@@ -152,7 +152,7 @@ class KeypointTracker:
         """The pose, its variances, and how badly it fits [m], from one frame alone, left and right as they fit best."""
         found, other = [], self.skeleton.layout.mirrored
         betas = np.zeros(N_BETAS) if self._known is None else self._known
-        neutral = Pose(np.zeros(3), exp_so3(np.where(SPREAD < 10, MEAN, 0.0)), betas)
+        neutral = Pose(np.zeros(3), exp_so3(MEAN), betas)
         for sides in (seen, _Seen(seen.points[other], seen.weights[other])):
             pose = first_pose(self.skeleton, sides.points, sides.weights > 0, neutral)
             if pose is not None:

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, TrackerSettings, layout_of
+from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, layout_of
 from refu_core.recordings._recording import Recording
 from refu_core.recordings._upright import Axes, to_smpl
 from refu_core.skeleton import PARENTS
 
-_SETTINGS = TrackerSettings(noise=0.01, rest_after=1.0)
 _FIT = 100  # frames that a person's shape is taken from
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
 _LEG = 0.82
@@ -68,12 +67,12 @@ def follow(
     skeleton = Skeleton(layout_of("recording", tuple(points)), known_body)
     if betas is None:
         some = np.linspace(0, len(places) - 1, min(_FIT, len(places))).astype(int)
-        shapes = [KeypointTracker(skeleton, settings=_SETTINGS).update(places[i], 0) for i in some]
+        shapes = [KeypointTracker(skeleton).update(places[i], 0) for i in some]
         known = [frame.betas for frame in shapes if frame is not None]
         if not known:
             raise ValueError("its joints are in no order that a person's are in")
         betas = np.median(known, axis=0)
-    track = KeypointTracker(skeleton, betas=betas, settings=_SETTINGS)
+    track = KeypointTracker(skeleton, betas=betas)
     frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
     poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
     transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
