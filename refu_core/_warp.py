@@ -60,7 +60,9 @@ class Unpicklable:
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Raises `RefuError`, for copies too."""
         name = type(self).__name__
-        raise RefuError(f"{name} can't be copied, pickled or sent to a process: make another there, of its arguments")
+        raise RefuError(
+            f"{name} can't be copied, pickled or sent to a process: make another one there, of the same arguments"
+        )
 
 
 def as_warp(tensor: Tensor, dtype: Any) -> Any:
