@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.spatial.transform import Rotation
 
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.keypoints._pose import Array, Pose, Skeleton, log_so3, skew
+from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3, skew
 from refu_core.skeleton import JOINT_NAMES, PARENTS
 
 
@@ -257,10 +257,14 @@ _TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17)
 """Joints that turn with the pelvis, more or less."""
 _LIMBS = ((16, 18, 20, 1.0), (17, 19, 21, 1.0), (1, 4, 7, -1.0), (2, 5, 8, -1.0))
 """Ball, hinge, end; and which way along z a bending hinge moves the end in the T-pose: forearms forward, shins back."""
+_HINGED = np.array([limb[:2] for limb in _LIMBS])
 _LEAST = 0.05
 """Least length [m] of a vector that gives a direction; least half width of a trunk that shows which way it faces."""
 _BENT = 0.15
 """Least sine of a bend that shows which way a limb is turned."""
+_TURNS_ABOUT = np.radians(np.arange(0, 360, 30))
+_FAR_LIKELIER = 9.0
+"""Difference of squared deviations: as much as of three standard deviations from none."""
 
 
 def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start: Pose) -> Pose | None:
@@ -299,6 +303,34 @@ def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start
         if has_end:
             turns[hinge] = _aligned([bones[end]], [turns[ball].T @ lower])
     return Pose(pelvis, turns, start.betas)
+
+
+def twisted_wrongly(pose: Pose, bones: Array) -> list[tuple[int, int, Array]]:
+    """Limbs that would be far likelier if they were turned about their upper bone, which moves no keypoint.
+
+    A straight arm doesn't show how it is turned; where that was guessed wrongly, its elbow bends the wrong way, and no
+    small step mends it. `bones` (24, 3) are as from `Skeleton.bones`. Returns ball, hinge, and the turn (3, 3) in the
+    ball's own axes, which the hinge has to undo.
+    """
+    wrong = []
+    odds = _squared_deviations(_HINGED.ravel(), pose.turns[_HINGED.ravel()]).reshape(_HINGED.shape).sum(axis=1)
+    for ball, hinge in _HINGED[odds > _FAR_LIKELIER]:
+        axis = bones[hinge] / max(float(np.linalg.norm(bones[hinge])), _LEAST)
+        turns = exp_so3(_TURNS_ABOUT[:, None] * axis)
+        tried = np.stack([pose.turns[ball] @ turns, turns.swapaxes(1, 2) @ pose.turns[hinge]], axis=1)
+        joints = np.tile([ball, hinge], len(turns))
+        odds = _squared_deviations(joints, tried.reshape(-1, 3, 3)).reshape(-1, 2).sum(axis=1)
+        best = int(np.argmin(odds))
+        if odds[0] - odds[best] > _FAR_LIKELIER:
+            wrong.append((ball, hinge, turns[best]))
+    return wrong
+
+
+def _squared_deviations(joints: NDArray[np.intp], turns: Array) -> Array:
+    """How far `joints` (n,) with these turns (n, 3, 3) are from their rest, in squared standard deviations, (n,)."""
+    off = log_so3(turns) - MEAN[joints]
+    squared: Array = np.einsum("ni,nij,nj->n", off, PRECISION[joints], off)
+    return squared
 
 
 def _aligned(before: list[Array], after: list[Array]) -> Array:

@@ -19,7 +19,17 @@ from numpy.typing import ArrayLike
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3
-from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, Solution, Solver, TrackerSettings, first_pose
+from refu_core.keypoints._solver import (
+    BETAS,
+    MEAN,
+    N_PARTS,
+    TURNS,
+    Solution,
+    Solver,
+    TrackerSettings,
+    first_pose,
+    twisted_wrongly,
+)
 
 DEFAULTS = TrackerSettings()
 
@@ -237,8 +247,17 @@ class KeypointTracker:
         self._rate_variance = np.maximum(self._rate_variance - gain * self._mixed * shrunk, 0.0)
         self._mixed = gain * variance
         self._variance, self._pose = variance, after
+        self._untwist()
         self._seen_at = self._stamp
         self._learn_noise(seen, dt)
+
+    def _untwist(self) -> None:
+        """Turns limbs that bend the wrong way about their upper bones, rates with them."""
+        for ball, hinge, turn in twisted_wrongly(self._pose, self.skeleton.bones(self._pose.betas)):
+            turns, rates = self._pose.turns.copy(), self._rate[TURNS].reshape(N_JOINTS, 3)
+            turns[ball], turns[hinge] = turns[ball] @ turn, turn.T @ turns[hinge]
+            rates[ball] = turn.T @ rates[ball]
+            self._pose = Pose(self._pose.pelvis, turns, self._pose.betas)
 
     def _learn_noise(self, seen: _Seen, dt: float) -> None:
         """Adapts to the tracker's noise, by the median distance that is left after the fit."""
