@@ -34,10 +34,11 @@ class TrackerSettings:
     """Noise added for keypoints beside a joint, whose places differ between people and trackers [m]."""
     unsure_noise: float = 0.05
     """Noise added for keypoints that may be elsewhere on the trunk [m]: between neck and shoulders there are 10 cm."""
-    shape_pull: float = 10.0
+    shape_pull: float = 5.0
     """How many times the betas' own spread of 1 pulls them to 0 in `rest_after`: trackers are off by centimetres, alike
-    in every frame. On 40 recordings of eight layouts the largest beta is 1.2 on average instead of 2.7, and keypoints
-    are missed by 3 mm more; joints of people with betas of 0.8 and noise of 10 mm are off by 8.9 mm instead of 8.7."""
+    in every frame. On 40 recordings of eight layouts the largest beta is 1.5 on average instead of 2.7, and keypoints
+    are missed by 2 mm more; of known betas of 2, 1.9 is found of the first and 0.4 to 1 of the next three, instead of
+    2.0 and 0.8 to 1.6, and joints are off by 0.1 mm more."""
     push: float = 5.0
     """Power of the pelvis's acceleration [m²/s³]: about 9 m/s² for 60 ms."""
     twist: float = 80.0
