@@ -56,11 +56,13 @@ class KeypointTracker:
         self._settings = settings
         self._known = None if betas is None else np.asarray(betas, np.float64)
         self._solver = Solver(skeleton, fits_betas=betas is None, settings=settings)
-        joints, other = skeleton.layout.joints, skeleton.layout.mirrored
+        layout = skeleton.layout
+        joints, other = layout.joints, layout.mirrored
         self._sides = [np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS]
         power = [np.full(3, settings.push), np.full(3 * N_JOINTS, settings.twist), np.zeros(N_BETAS)]
         self._power = np.concatenate(power) / settings.smoothing**2
-        self._offset = settings.offset_noise * skeleton.layout.offsets.any(axis=1)
+        self._offset = np.where(layout.is_joint, 0.0, settings.offset_noise)
+        self._offset[~layout.is_sure] = settings.unsure_noise
         self.reset()
 
     def reset(self) -> None:
@@ -143,7 +145,7 @@ class KeypointTracker:
         is_percent = weights.max(initial=0.0) > _MOST_SCORE
         weights = np.minimum(weights / 100 if is_percent else weights, 1.0)
         here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
-        weights[~here | (weights < _LEAST)] = 0.0
+        weights[~here | (weights < _LEAST) | ~self.skeleton.layout.is_told] = 0.0
         return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
 
     # Beginnings -----------------------------------------------------------------------------------
