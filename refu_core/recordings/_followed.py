@@ -29,6 +29,7 @@ SMPL_POINTS = tuple(_SMPL.split())
 """SMPL's joints that SMPL-H and SMPL-X also have, by their names in the keypoint layouts."""
 _BONES = (0.4, 2.5)
 """Least and greatest ratio of a bone's length to the mean body's, each taken as a share of the length of the legs."""
+_TRUNK = [SMPL_POINTS.index(name) - 1 for name in ("spine_low", "spine_mid", "spine_high", "neck")]
 _NOTHING = 1e-3  # least length of the legs, in the file's unit: bodies of zeros have none
 
 N_KEYPOINTS = 70
@@ -96,8 +97,14 @@ def are_places(array: NDArray[np.float64]) -> bool:
         return False
     known = Proportions.builtin("neutral").joints
     lengths = np.linalg.norm(known[child] - known[parent], axis=-1)
-    share = bones / legs[:, None] / (lengths / lengths[[3, 4, 6, 7]].sum())
+    share = _joined(bones) / legs[:, None] / (_joined(lengths) / lengths[[3, 4, 6, 7]].sum())
     return bool((~(share < low) & ~(share > high)).all())
+
+
+def _joined(bones: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths of bones (..., n) with those of the trunk as one, for betas move its joints along it."""
+    trunk = bones[..., _TRUNK].sum(axis=-1, keepdims=True)
+    return np.concatenate((np.delete(bones, _TRUNK, axis=-1), trunk), axis=-1)
 
 
 def metres_of(points: Sequence[str], places: NDArray[np.float64], notes: list[str]) -> float:

@@ -5,7 +5,7 @@ A file is recognised by the names of its arrays. How an array holds rotations is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,8 @@ SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".
 
 
 ROOT_PLACES = ("root_translation", "root_trans", "root_transl")
+PELVIS_PLACES = ("root_trans_offset", "root_trans_world", "root_trans_cam")
+"""Names of translations that are where the pelvis is, instead of how far the mesh is moved."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +90,17 @@ LAYOUTS: tuple[Layout, ...] = (
     ),
     Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",)),
     Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",)),
-    Layout(writers="PHC and other humanoid controllers", pose=("pose_aa",), transl=("trans_orig", "trans")),
+    Layout(
+        writers="GLAMR, in the world",
+        pose=("smpl_orient_world", "smpl_pose"),
+        transl=("root_trans_world",),
+        betas=("smpl_beta",),
+    ),
+    Layout(
+        writers="PHC and other humanoid controllers",
+        pose=("pose_aa",),
+        transl=("trans_orig", "trans", "root_trans_offset"),
+    ),
     Layout(
         writers="Meshcapade",
         pose=("bodyPose",),
@@ -99,9 +111,16 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
     Layout(writers="WHAM, VIBE, CLIFF, in the camera", pose=("pose",), transl=("trans", "global_t", "transl")),
     Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",)),
+    Layout(
+        writers="GLAMR, in the camera",
+        pose=("smpl_orient_cam", "smpl_pose"),
+        transl=("root_trans_cam",),
+        betas=("smpl_beta",),
+    ),
     Layout(writers="a body without its root", pose=("pose_body",), is_whole=False),
     Layout(writers="a body without its root", pose=("body_pose",), is_whole=False),
     Layout(writers="joints alone", pose=("joints",), is_whole=False, holds_places=True),
+    Layout(writers="whom a robot follows", pose=("smpl_joints",), is_whole=False, holds_places=True),
     Layout(writers="MDM's samples", pose=("motion",), is_whole=False, is_time_last=True, holds_places=True),
     MHR,
 )
@@ -148,14 +167,14 @@ COLUMN_WORDS = tuple(map(spelled, COLUMNS))
 _POSES = tuple(spelled(layout.pose[0]) for layout in LAYOUTS)
 
 
-def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
-    """Known names for those `keys` that are spelled differently or have a prefix; none where there is no pose.
+def names_like(keys: Iterable[str | int]) -> Iterator[tuple[Layout, dict[str | int, str]]]:
+    """Known names for those `keys` that are spelled differently or have a prefix, in every way that gives a pose.
 
     Trackers write `smpl_body_pose`, `globalOrient` and `Body-Pose`.
     """
     by_spelling = {spelled(key): key for key in keys}
     if not any(word.endswith(_POSES) for word in by_spelling):
-        return {}
+        return
     for layout in LAYOUTS:
         first, *others = map(spelled, layout.pose)
         for word in by_spelling:
@@ -166,8 +185,7 @@ def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
                 key: _SPELLED.get(word.removeprefix(before), _SPELLED.get(word)) for word, key in by_spelling.items()
             }
             known |= {by_spelling[before + spelled(name)]: name for name in layout.pose}
-            return {key: name for key, name in known.items() if name not in (None, key)}
-    return {}
+            yield layout, {key: name for key, name in known.items() if name not in (None, key)}
 
 
 HUMANML_ADVICE = "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)"

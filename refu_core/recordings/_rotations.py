@@ -28,6 +28,8 @@ _ADVICE = {
 """What arrays of so many columns may be; the order of the columns differs between programs, so it isn't guessed."""
 LONGEST_TURN = 2 * np.pi + 0.1
 """An unwrapped rotation vector may be this long [rad]; the median of sound ones is never longer."""
+_FEWEST_HINGES, _STRAY = 10, 1e-6
+"""A robot turns at least this many joints [1], and none of them by more than this about a second axis [rad]."""
 _MOST_SKEW = 0.05  # largest entry of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
 _MOST_UNEVEN = 0.3  # mean deviation of raw network output from two orthonormal vectors; anything else has 0.5 at least
 
@@ -53,6 +55,15 @@ def rotvecs_of(
     else:
         matrices = _of_six(numbers, name, notes, first=0 if has_root else 1)
     return _rotvecs(matrices, name), n
+
+
+def are_hinges(array: NDArray[Any]) -> bool:
+    """Whether rotation vectors (T, n, 3) or (T, 3n), the root first, are a robot's: no joint turns about two axes."""
+    is_flat = array.ndim == 2 and array.shape[1] % 3 == 0
+    if array.dtype.kind != "f" or not (is_flat or (array.ndim == 3 and array.shape[2] == 3)) or not array.size:
+        return False
+    n_axes = (np.abs(array.reshape(len(array), -1, 3)[:, 1:]) > _STRAY).any(axis=0).sum(axis=1)
+    return bool(n_axes.max(initial=0) == 1 and n_axes.sum() >= _FEWEST_HINGES)
 
 
 def is_one_frame(shape: tuple[int, ...], counts: Collection[int]) -> bool:

@@ -1,0 +1,110 @@
+"""Files of motion as other people's programs lay them out, made up here in the same way."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from test_recordings import POSES, TRANSL, Z_UP, T, same, turned
+
+from msg_adapters import MotionFileError, read_motion
+from refu_core import load_body
+from refu_core.recordings import PELVIS
+
+BETAS = np.linspace(-1, 1, 10)
+JOINTS = load_body("male")(POSES.astype(np.float32), transl=TRANSL.astype(np.float32)).joints.double().numpy()
+
+
+def pickled(path: Path, content: Any) -> Path:
+    path.write_bytes(pickle.dumps(content))
+    return path
+
+
+def robot(n: int) -> np.ndarray[Any, Any]:
+    """Rotation vectors of a robot's joints, the root first: each turns about one axis."""
+    poses = np.zeros((T, n, 3))
+    for joint in range(1, n):
+        poses[:, joint, joint % 3] = np.sin(np.linspace(0, joint, T))
+    poses[:, 0] = POSES[:, 0]
+    return poses
+
+
+@pytest.mark.parametrize("frame", ["world", "cam"])
+def test_glamr_is_read_in_the_world_or_else_in_the_camera(tmp_path: Path, frame: str) -> None:
+    """Its root's translation is where the pelvis is. Cameras' poses have a name like a person's."""
+    person = {"smpl_pose": POSES[:, 1:].reshape(T, 69), "smpl_beta": np.tile(BETAS, (T, 1))}
+    for name in ("cam", "world") if frame == "world" else ("cam",):
+        root = POSES[:, 0] if name == frame else turned(POSES, Z_UP)[:, 0]
+        place = TRANSL + PELVIS if name == frame else np.zeros((T, 3))
+        person |= {f"smpl_orient_{name}": root, f"root_trans_{name}": place}
+    camera = np.tile(np.eye(4), (T, 1, 1))
+    motion = read_motion(pickled(tmp_path / "a.pkl", {"person_data": {0: person}, "cam_pose": camera}), fps=30)
+    same(motion)
+    np.testing.assert_allclose(motion.transl, TRANSL, atol=1e-9)
+    np.testing.assert_allclose(motion.betas, BETAS, atol=1e-6)
+    assert ("in a camera, too" in "; ".join(motion.notes)) == (frame == "world")
+
+
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_of_like_names_the_one_of_a_pose_is_taken(tmp_path: Path, is_nested: bool) -> None:
+    person = {"est_pose": POSES.reshape(T, 72), "est_trans": TRANSL}
+    camera = {"cam_pose": np.tile(np.eye(4), (T, 1, 1)), "left_hand_pose": np.zeros((T, 45))}
+    content = {**camera, "who": person} if is_nested else {**camera, **person}
+    motion = read_motion(pickled(tmp_path / "a.pkl", content), fps=30)
+    same(motion)
+    np.testing.assert_allclose(motion.transl, TRANSL)
+
+
+def test_errors_name_arrays_as_the_file_does(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a", cam_pose=np.tile(np.eye(4), (T, 1, 1)), fps=30)
+    with pytest.raises(MotionFileError, match=r"cam_pose must be .* got \(30, 4, 4\)"):
+        read_motion(tmp_path / "a.npz")
+    np.savez(tmp_path / "a", posed_joints=np.ones((T, 34, 3)), fps=30)
+    with pytest.raises(MotionFileError, match=r"posed_joints \(30, 34, 3\): no places of SMPL's joints"):
+        read_motion(tmp_path / "a.npz")
+    with pytest.raises(MotionFileError, match=r"motion \(30, 276\): no places of SMPL's joints"):
+        read_motion(pickled(tmp_path / "a.pkl", {"motion": np.ones((T, 276))}), fps=30)
+    with pytest.raises(MotionFileError, match=r"no poses; wanted .*; the file has 0-walk_poses, issue"):
+        read_motion(pickled(tmp_path / "a.pkl", {"0-walk_poses": {"issue": "stool"}}), fps=30)
+
+
+@pytest.mark.parametrize("n_joints", [22, 24, 27])
+@pytest.mark.parametrize("name", ["pose_aa", "poses"])
+def test_a_robot_is_not_taken_for_a_person(tmp_path: Path, name: str, n_joints: int) -> None:
+    clip = {name: robot(n_joints), "root_trans_offset": TRANSL, "dof": np.ones((T, n_joints - 1)), "fps": 30}
+    with pytest.raises(MotionFileError, match=f"{name} .30, {n_joints}, 3.: each joint turns about one axis, as a rob"):
+        read_motion(pickled(tmp_path / "a.pkl", {"0-walk_poses": clip}))
+    clip["smpl_joints"] = np.zeros((T, n_joints, 3)) + np.arange(3)
+    with pytest.raises(MotionFileError, match=r"as a robot's do; wanted a person's|no places of SMPL's joints"):
+        read_motion(pickled(tmp_path / "a.pkl", {"0-walk_poses": clip}))
+    clip["smpl_joints"] = JOINTS
+    motion = read_motion(pickled(tmp_path / "a.pkl", {"0-walk_poses": clip}))
+    notes = "; ".join(motion.notes)
+    assert f"{name} (30, {n_joints}, 3) is left out: each joint turns about one axis" in notes
+    assert "smpl_joints (30, 24, 3) holds places of joints" in notes
+    got = load_body("neutral")(motion.poses, motion.betas[None], motion.transl.astype(np.float32)).joints.numpy()
+    assert np.linalg.norm(got - JOINTS, axis=2)[:, :22].mean() < 0.01
+
+
+def test_a_place_of_the_pelvis_is_no_translation_of_the_mesh(tmp_path: Path) -> None:
+    clip = {"pose_aa": POSES, "root_trans_offset": TRANSL + PELVIS, "fps": 30}
+    np.testing.assert_allclose(read_motion(pickled(tmp_path / "a.pkl", clip)).transl, TRANSL, atol=1e-9)
+
+
+def test_a_spine_whose_joints_are_elsewhere_is_still_a_persons(tmp_path: Path) -> None:
+    """Large betas, as those that fit a robot, move the joints of the trunk along it."""
+    joints = JOINTS[:, :22].copy()
+    for joint, share in ((3, 0.1), (6, 0.3), (9, 0.4)):
+        joints[:, joint] = joints[:, 0] + share * (joints[:, 12] - joints[:, 0])
+    np.savez(tmp_path / "a", joints=joints, fps=30)
+    assert "holds places of joints" in "; ".join(read_motion(tmp_path / "a.npz").notes)
+
+
+def test_a_tensor_alone(tmp_path: Path) -> None:
+    torch.save(torch.tensor(POSES), tmp_path / "a.pt")
+    same(read_motion(tmp_path / "a.pt", fps=30))
+    same(read_motion(pickled(tmp_path / "a.pkl", POSES), fps=30))
