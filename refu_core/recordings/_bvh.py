@@ -100,7 +100,7 @@ def _words(line: str) -> list[str]:
     """The words of a line, with a joint's name as one of them."""
     words = line.split()
     end = len(words) - (words[-1:] == ["{"])
-    if end < 3 or words[0] not in ("ROOT", "JOINT"):
+    if end < 3 or words[0].upper() not in ("ROOT", "JOINT"):
         return words
     return [words[0], "_".join(words[1:end]), *words[end:]]
 
@@ -110,9 +110,10 @@ def _joints(words: Iterator[str]) -> list[_Joint]:
     open_: list[int] = []
     try:
         for word in words:
-            if word in ("ROOT", "JOINT", "End"):
+            word = word.upper()
+            if word in ("ROOT", "JOINT", "END"):
                 name = next(words)
-                joints.append(_Joint("" if word == "End" else name, open_[-1] if open_ else -1, np.zeros(3)))
+                joints.append(_Joint("" if word == "END" else name, open_[-1] if open_ else -1, np.zeros(3)))
             elif word == "{":
                 open_.append(len(joints) - 1)
             elif word == "}":
@@ -231,11 +232,13 @@ def _sided(name: str) -> tuple[str, str]:
     """The side (`l`, `r` or empty) and the rest of a joint's name, in any of the ways that tools write them."""
     bare = re.sub(rf"(?i)(?<=.)[_. -](?:{_SUFFIXES})$", "", re.split(r"[:|]", name)[-1])
     match = re.fullmatch(r"(?i)(?:.*[_. -])?(left|right)[_. -]?(.+)", bare)
-    match = match or re.fullmatch(r"(?:.*[_. -])?([lLrR])(?:[_. -]|(?=[A-Z]))(.+)", bare)
+    at_end = None if match else re.fullmatch(r"(?i)(.+?)[_. -](left|right)", bare)
+    if not at_end:
+        match = match or re.fullmatch(r"(?:.*[_. -])?([lLrR])(?:[_. -]|(?=[A-Z]))(.+)", bare)
     if match:
         side, rest = match[1], match[2]
     else:
-        match = re.fullmatch(r"(?i)(.+?)[_. -](left|right|l|r)", bare) or re.fullmatch(r"(.+[a-z])(Left|Right)", bare)
+        match = at_end or re.fullmatch(r"(?i)(.+?)[_. -](l|r)", bare) or re.fullmatch(r"(.+[a-z])(Left|Right)", bare)
         rest, side = (match[1], match[2]) if match else (bare, "")
         rest = re.sub(r"^(?:[A-Za-z0-9]+[_-])+(?=[A-Za-z])", "", rest)
     rest = re.sub(r"[^a-z0-9]", "", rest.lower())

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, layout_of
-from refu_core.recordings._recording import Recording
+from refu_core.recordings._recording import Recording, tell_pace
 from refu_core.recordings._upright import Axes, to_smpl
 from refu_core.skeleton import PARENTS
 
@@ -75,6 +75,7 @@ def follow(
     pelvis = known_body.of(betas.astype(np.float64))[0]
     roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual=usual, pelvis=pelvis)
     poses[:, 0] = roots
+    tell_pace(transl, fps, notes)
     is_fitted = worn is not None
     return Recording(
         poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes), is_fitted

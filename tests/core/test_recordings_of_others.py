@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_recordings import POSES, TRANSL, Z_UP, T, same, turned
+from test_recordings import POSES, TRANSL, Z_UP, T, bvh, same, turned
 
 from msg_adapters import MotionFileError, read_motion
 from refu_core import load_body
@@ -108,3 +108,34 @@ def test_a_tensor_alone(tmp_path: Path) -> None:
     torch.save(torch.tensor(POSES), tmp_path / "a.pt")
     same(read_motion(tmp_path / "a.pt", fps=30))
     same(read_motion(pickled(tmp_path / "a.pkl", POSES), fps=30))
+
+
+AZURE = "PELVIS HIP_LEFT HIP_RIGHT SPINE_NAVAL KNEE_LEFT KNEE_RIGHT SPINE_CHEST ANKLE_LEFT ANKLE_RIGHT SPINE_TOP "
+AZURE += (
+    "FOOT_LEFT FOOT_RIGHT NECK CLAVICLE_LEFT CLAVICLE_RIGHT HEAD SHOULDER_LEFT SHOULDER_RIGHT ELBOW_LEFT ELBOW_RIGHT "
+)
+AZURE += "WRIST_LEFT WRIST_RIGHT HAND_LEFT HAND_RIGHT"
+
+
+def test_bvh_of_azure_kinect_in_capitals(tmp_path: Path) -> None:
+    (tmp_path / "a.bvh").write_text(bvh(AZURE.split(), 100.0, n=2)[0])
+    notes = "; ".join(read_motion(tmp_path / "a.bvh").notes)
+    assert "is fitted by the positions of 18" in notes
+    assert "not found" not in notes
+
+
+def test_words_of_bvh_in_any_case(tmp_path: Path) -> None:
+    text = bvh(AZURE.split(), 100.0, n=2)[0]
+    (tmp_path / "a.bvh").write_text(text)
+    (tmp_path / "b.bvh").write_text(
+        text.replace("ROOT", "Root").replace("JOINT", "joint").replace("End Site", "END SITE")
+    )
+    one, other = (read_motion(tmp_path / name) for name in ("a.bvh", "b.bvh"))
+    np.testing.assert_array_equal(one.poses, other.poses)
+
+
+def test_jumps_of_followed_people_are_told(tmp_path: Path) -> None:
+    joints = JOINTS.copy()
+    joints[T // 2 :] += [0, 0, 30]
+    np.savez(tmp_path / "a", joints=joints, fps=30)
+    assert "the person jumps by 30.0 m after frame 14" in "; ".join(read_motion(tmp_path / "a.npz").notes)
