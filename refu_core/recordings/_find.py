@@ -15,13 +15,18 @@ from refu_core._pickle_machine import Record
 from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import Content, Key, entries
 from refu_core.recordings._followed import is_of_mhr
-from refu_core.recordings._rotations import are_hinges, is_one_frame
+from refu_core.recordings._rotations import BODY, are_hinges, flexion_of, is_one_frame
 from refu_core.recordings._tables import told_apart
 from refu_core.recordings._tracks import frames_of
 from refu_core.recordings._values import word_of
 
 _WORLD, _CAMERA = ("world", "global"), ("cam", "incam", "camera")
 _SHOWN = 8
+_WITH_PLACE = (69, 75)
+"""Columns of an array that may be those of a pose, of 22 or 24 joints, and of a translation [1]."""
+_CLEARLY = 0.5
+"""Knees and elbows must bend by so much more in one reading than in any other [rad]: of real clips, walks and dances
+have 0.7 and more, stiff exercises less."""
 _MOST_WAYS = 1000
 """Most arrays that are looked at for names like a pose's; files have some dozens."""
 
@@ -210,7 +215,27 @@ def _bare(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
         return arrays | {table.MODELS[0]: "smplx"}
     if array.ndim == 2 and array.shape[1] == 263:
         raise ValueError(f"263 columns are HumanML3D features; {table.HUMANML_ADVICE}")
-    return {"poses": array}
+    return _apart(array, notes) if array.ndim == 2 and array.shape[1] in _WITH_PLACE else {"poses": array}
+
+
+def _apart(array: NDArray[Any], notes: list[str]) -> dict[Key, Any]:
+    """A pose and a translation in one array (T, n), in the order in which knees and elbows bend as they can.
+
+    Raises `ValueError` if that doesn't show.
+    """
+    n = array.shape[1] - 3
+    ways: dict[str, dict[Key, Any]] = {
+        f"3 columns of a translation and {n} of a pose": {"poses": array[:, 3:], "trans": array[:, :3]},
+        f"{n} columns of a pose and 3 of a translation": {"poses": array[:, :n], "trans": array[:, n:]},
+    }
+    if n + 3 in (3 * joints for joints in BODY):
+        ways["a body without its root"] = {"poses": array}
+    bent = {way: flexion_of(arrays["poses"], first=int(len(arrays) == 1)) for way, arrays in ways.items()}
+    *_, second, best = sorted(bent, key=lambda way: bent[way])
+    if not bent[best] - bent[second] > _CLEARLY:
+        raise ValueError(f"{array.shape} may be {' or '.join(ways)}: save them apart, as poses and trans")
+    notes.append(f"taken as {best}: knees and elbows bend so")
+    return ways[best]
 
 
 def person_of(path: tuple[Key, ...]) -> str:

@@ -30,6 +30,8 @@ LONGEST_TURN = 2 * np.pi + 0.1
 """An unwrapped rotation vector may be this long [rad]; the median of sound ones is never longer."""
 _FEWEST_HINGES, _STRAY = 10, 1e-6
 """A robot turns at least this many joints [1], and none of them by more than this about a second axis [rad]."""
+_ENOUGH = 1000
+"""Frames that show how limbs bend [1]; a million would fill the memory."""
 _MOST_SKEW = 0.05  # largest entry of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
 _MOST_UNEVEN = 0.3  # mean deviation of raw network output from two orthonormal vectors; anything else has 0.5 at least
 
@@ -186,6 +188,14 @@ def _completed(a: Array, b: Array) -> Array:
     b = b - (x * b).sum(axis=-1, keepdims=True) * x
     y = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), tiny)
     return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+def flexion_of(vectors: NDArray[Any], *, first: int) -> float:
+    """How far knees and elbows bend the way they can [rad], in rotation vectors (T, 3n); `first` as in `_of_six`."""
+    some = vectors[:: len(vectors) // _ENOUGH + 1].astype(np.float64)
+    some = some[np.isfinite(some).all(axis=1)]
+    matrices = Rotation.from_rotvec(some.reshape(-1, 3)).as_matrix()
+    return _flexion(matrices.reshape(len(some), vectors.shape[1] // 3, 3, 3), first)
 
 
 def _flexion(matrices: Array, first: int) -> float:

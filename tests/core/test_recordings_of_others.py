@@ -139,3 +139,24 @@ def test_jumps_of_followed_people_are_told(tmp_path: Path) -> None:
     joints[T // 2 :] += [0, 0, 30]
     np.savez(tmp_path / "a", joints=joints, fps=30)
     assert "the person jumps by 30.0 m after frame 14" in "; ".join(read_motion(tmp_path / "a.npz").notes)
+
+
+@pytest.mark.parametrize("n", [66, 72])
+@pytest.mark.parametrize("is_first", [False, True])
+def test_a_translation_in_a_poses_array_is_told_apart(tmp_path: Path, n: int, is_first: bool) -> None:
+    """Without that, 69 columns were taken for a body without its root."""
+    pose = POSES.reshape(T, 72)[:, :n]
+    np.save(tmp_path / "a", np.concatenate((TRANSL, pose) if is_first else (pose, TRANSL), axis=1))
+    motion = read_motion(tmp_path / "a.npy", fps=30)
+    same(motion, joints=22)
+    np.testing.assert_allclose(motion.transl, TRANSL)
+    assert "of a translation" in "; ".join(motion.notes)
+
+
+def test_a_body_without_a_root_and_a_name(tmp_path: Path) -> None:
+    np.save(tmp_path / "a", POSES[:, 1:].reshape(T, 69))
+    same(read_motion(tmp_path / "a.npy", fps=30), root=False)
+    for still in (np.zeros((T, 69)), np.full((T, 69), np.nan)):
+        np.save(tmp_path / "a", still)
+        with pytest.raises(MotionFileError, match=r"may be 3 columns of a translation .* save them apart"):
+            read_motion(tmp_path / "a.npy", fps=30)
