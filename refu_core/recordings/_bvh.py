@@ -86,6 +86,7 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     if len(joints) > n_channels:  # joints that the file says nothing of would take memory in every frame
         raise ValueError(f"wanted at least as many channels as joints, got {n_channels} and {len(joints)}")
     numbers = np.array(motion[head.end() :].split(), dtype=np.float64)
+    count = count or numbers.size // n_channels  # programs that were stopped leave a zero there
     if not 0 < count <= MAX_FRAMES or numbers.size != count * n_channels or not np.isfinite(numbers).all():
         finite = int(np.isfinite(numbers).sum())
         msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
@@ -194,7 +195,9 @@ def _points(joints: list[_Joint], places: Array) -> dict[str, int]:
     sides: dict[tuple[str, str], int] = {}
     for i, joint in enumerate(joints):
         if joint.name:
-            sides.setdefault(_sided(joint.name), i)
+            key = _sided(joint.name)
+            if len(joint.name) < len(joints[sides.setdefault(key, i)].name):  # beside L_Hip, Pelvis_L_Hip is a helper
+                sides[key] = i
     points: dict[str, int] = {}
     for part, names in _NAMES.items():
         for side in ("l", "r") if part in _SIDED else ("",):
@@ -204,9 +207,11 @@ def _points(joints: list[_Joint], places: Array) -> dict[str, int]:
                 points[f"{side}_{part}" if side else part] = found
     if "pelvis" not in points and (pelvis := _between(joints, places, points)) is not None:
         points["pelvis"] = pelvis
-    end = next((i for i, joint in enumerate(joints) if not joint.name and joint.parent == points.get("head")), None)
-    if end is not None:
-        points["head_top"] = end
+    ends = {joint.parent: i for i, joint in reversed(list(enumerate(joints))) if not joint.name}
+    bones = [(f"{side}_{a}", f"{side}_{b}") for side in "lr" for a, b in (("knee", "ankle"), ("elbow", "wrist"))]
+    for bearer, point in (*bones, ("head", "head_top")):
+        if point not in points and points.get(bearer) in ends:
+            points[point] = ends[points[bearer]]
     return points
 
 

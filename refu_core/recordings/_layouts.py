@@ -120,6 +120,7 @@ LAYOUTS: tuple[Layout, ...] = (
     Layout(writers="a body without its root", pose=("pose_body",), is_whole=False),
     Layout(writers="a body without its root", pose=("body_pose",), is_whole=False),
     Layout(writers="joints alone", pose=("joints",), is_whole=False, holds_places=True),
+    Layout(writers="joints alone", pose=("joint_positions",), is_whole=False, holds_places=True),
     Layout(writers="whom a robot follows", pose=("smpl_joints",), is_whole=False, holds_places=True),
     Layout(writers="MDM's samples", pose=("motion",), is_whole=False, is_time_last=True, holds_places=True),
     MHR,

@@ -30,8 +30,13 @@ LONGEST_TURN = 2 * np.pi + 0.1
 """An unwrapped rotation vector may be this long [rad]; the median of sound ones is never longer."""
 _FEWEST_HINGES, _STRAY = 10, 1e-6
 """A robot turns at least this many joints [1], and none of them by more than this about a second axis [rad]."""
-_ENOUGH = 1000
-"""Frames that show how limbs bend [1]; a million would fill the memory."""
+_ENOUGH, _FEW, _FEWEST = 1000, 100, 3
+"""Frames that show how limbs bend, frames that show whether there are bones, and the fewest that do [1]."""
+_MOVES, _RIGID = 0.01, 0.01
+"""Places move by this much, in any unit, and their bones' lengths change by a smaller share [1]. In rotations of
+people, some joint's share is 0.06 at least."""
+_HUGE = 1e6
+"""Frames with larger numbers show neither [1]; their squares may overflow."""
 _MOST_SKEW = 0.05  # largest entry of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
 _MOST_UNEVEN = 0.3  # mean deviation of raw network output from two orthonormal vectors; anything else has 0.5 at least
 
@@ -50,6 +55,11 @@ def rotvecs_of(
         raise ValueError(f"{name} {array.shape} looks like quaternions, whose order a file doesn't say; {hint}")
     if size == 3:
         _check_radians(numbers, name)
+        if n > 1 and _are_on_bones(numbers):
+            what = f"{name} {array.shape} holds places of joints, in another order than SMPL's"
+            raise ValueError(
+                f"{what}: save them as joints, in SMPL's order, or give them as keypoints (docs/guide/inputs.md)"
+            )
         return numbers, n
     if size == 9:
         matrices = numbers.reshape(frames, n, 3, 3)
@@ -127,6 +137,17 @@ def _check_radians(vectors: Array, name: str) -> None:
         raise ValueError(f"{what}, wanted radians, 6.3 at most; where they are degrees, save np.radians of them")
 
 
+def _are_on_bones(vectors: Array) -> bool:
+    """Whether vectors (T, n, 3) are places: each moves, but stays as far from another one, as the ends of bones do."""
+    some = vectors[:: len(vectors) // _FEW + 1]
+    some = some[(np.abs(some) < _HUGE).all(axis=(1, 2))]
+    if len(some) < _FEWEST or not (some.std(axis=0).max(axis=1) > _MOVES).all():
+        return False
+    ways = np.linalg.norm(some[:, :, None] - some[:, None], axis=-1)
+    change = ways.std(axis=0) + np.diag(np.full(some.shape[1], np.inf))
+    return bool((change <= _RIGID * ways.mean(axis=0)).any(axis=1).all())
+
+
 def _rotvecs(matrices: Array, name: str) -> Array:
     """Rotation vectors of matrices (T, n, 3, 3); a frame in which one isn't finite, or is all zero, becomes NaN."""
     result = np.full((*matrices.shape[:2], 3), np.nan)
@@ -193,7 +214,7 @@ def _completed(a: Array, b: Array) -> Array:
 def flexion_of(vectors: NDArray[Any], *, first: int) -> float:
     """How far knees and elbows bend the way they can [rad], in rotation vectors (T, 3n); `first` as in `_of_six`."""
     some = vectors[:: len(vectors) // _ENOUGH + 1].astype(np.float64)
-    some = some[np.isfinite(some).all(axis=1)]
+    some = some[(np.abs(some) < _HUGE).all(axis=1)]
     matrices = Rotation.from_rotvec(some.reshape(-1, 3)).as_matrix()
     return _flexion(matrices.reshape(len(some), vectors.shape[1] // 3, 3, 3), first)
 

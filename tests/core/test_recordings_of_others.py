@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,55 @@ def test_words_of_bvh_in_any_case(tmp_path: Path) -> None:
     )
     one, other = (read_motion(tmp_path / name) for name in ("a.bvh", "b.bvh"))
     np.testing.assert_array_equal(one.poses, other.poses)
+
+
+def test_bvh_with_helpers(tmp_path: Path) -> None:
+    """MoDi and others put a joint before a limb, which bears the names of both."""
+    (tmp_path / "a.bvh").write_text(bvh(AZURE.split(), 100.0, n=2)[0])
+    names = AZURE.replace("CLAVICLE_", "SPINE_SHOULDER_")
+    (tmp_path / "b.bvh").write_text(bvh(names.split(), 100.0, n=2)[0])
+    one, other = (read_motion(tmp_path / name) for name in ("a.bvh", "b.bvh"))
+    np.testing.assert_array_equal(one.poses, other.poses)
+
+
+def test_bvh_of_limbs_that_end_without_a_name(tmp_path: Path) -> None:
+    text, joints = bvh(AZURE.split(), 100.0, n=3)
+    head, _, motion = text.partition("MOTION")
+    order = re.findall(r"(?:ROOT|JOINT) (\S+)", head)
+    gone = [order.index(name) for name in ("WRIST_LEFT", "HAND_LEFT")]
+    wrist = r"JOINT WRIST_LEFT\n{\n(OFFSET .*)\nCHANNELS.*\nJOINT HAND_LEFT\n{[^{}]*{[^{}]*}\n}\n}"
+    head, n = re.subn(wrist, r"End Site\n{\n\1\n}", head)
+    assert n == 1
+    rows = [line.split() for line in motion.splitlines()[3:]]
+    rows = [[*row[:3], *(row[3 + i] for i in range(3 * 24) if i // 3 not in gone)] for row in rows]
+    start = motion.splitlines()[:3]
+    (tmp_path / "a.bvh").write_text("\n".join([f"{head}MOTION", *start[1:], *(" ".join(row) for row in rows)]))
+    motion_read = read_motion(tmp_path / "a.bvh")
+    assert "is fitted by the positions of 18" in "; ".join(motion_read.notes)
+    body = load_body("neutral")
+    got = body(motion_read.poses, motion_read.betas[None], motion_read.transl.astype(np.float32)).joints.numpy()
+    assert np.linalg.norm(got - joints, axis=2)[:, 20].max() < 0.02
+
+
+def test_bvh_whose_frames_were_never_counted(tmp_path: Path) -> None:
+    text = bvh(AZURE.split(), 100.0, n=3)[0]
+    (tmp_path / "a.bvh").write_text(text.replace("Frames: 3", "Frames: 0"))
+    assert len(read_motion(tmp_path / "a.bvh")) == 3
+
+
+def test_places_of_another_skeleton_are_not_taken_for_rotations(tmp_path: Path) -> None:
+    """As LAFAN's, 22 joints in an order of their own, all within what radians may be."""
+    order = np.random.default_rng(0).permutation(22)
+    for name, array in (("a", JOINTS[:, order]), ("b", JOINTS[:, order].reshape(T, 66))):
+        np.save(tmp_path / name, array)
+        with pytest.raises(MotionFileError, match="holds places of joints, in another order than SMPL's: save them as"):
+            read_motion(tmp_path / f"{name}.npy", fps=30)
+
+
+def test_names_of_places(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a", global_joint_positions=JOINTS[:, :22], height=1.8)
+    notes = "; ".join(read_motion(tmp_path / "a.npz", fps=30).notes)
+    assert "global_joint_positions (30, 22, 3) holds places of joints" in notes
 
 
 def test_jumps_of_followed_people_are_told(tmp_path: Path) -> None:
