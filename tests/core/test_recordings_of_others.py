@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from test_recordings import POSES, TRANSL, Z_UP, T, bvh, same, turned
 
 from msg_adapters import MotionFileError, read_motion
@@ -182,6 +183,16 @@ def test_names_of_places(tmp_path: Path) -> None:
     np.savez(tmp_path / "a", global_joint_positions=JOINTS[:, :22], height=1.8)
     notes = "; ".join(read_motion(tmp_path / "a.npz", fps=30).notes)
     assert "global_joint_positions (30, 22, 3) holds places of joints" in notes
+
+
+@pytest.mark.parametrize("turns", [(130, 133, 80, 249, 186, 78, 207, 314), (8, -132, 32, 56, -111, -19, 144, 174)])
+def test_somebody_who_turns_at_cuts_is_not_wound_up(tmp_path: Path, turns: tuple[float, ...]) -> None:
+    """A spine that is wound up has its ends where one that isn't has them, and used to stay so."""
+    about = [Rotation.from_euler("y", angle, degrees=True) for angle in (*turns, *[turns[-1]] * 8)]
+    after = np.stack([turn.apply(JOINTS[0] - JOINTS[0, 0]) + JOINTS[0, 0] for turn in about])
+    np.savez(tmp_path / "a", joints=np.concatenate((JOINTS[:5], after)), fps=30)
+    poses = read_motion(tmp_path / "a.npz").poses
+    assert np.linalg.norm(poses[-1, [3, 6, 9]], axis=1).sum() < 0.5
 
 
 def test_jumps_of_followed_people_are_told(tmp_path: Path) -> None:
