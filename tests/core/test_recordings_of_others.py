@@ -92,6 +92,20 @@ def test_a_robot_is_not_taken_for_a_person(tmp_path: Path, name: str, n_joints: 
     assert np.linalg.norm(got - JOINTS, axis=2)[:, :22].mean() < 0.01
 
 
+@pytest.mark.parametrize("name", ["dof_pos", "joint_vel", "qpos"])
+def test_angles_of_a_robot_are_told_from_unknown_arrays(tmp_path: Path, name: str) -> None:
+    clip = {"fps": 50, "root_pos": TRANSL, "root_rot": np.ones((T, 4)), name: np.ones((T, 29))}
+    with pytest.raises(
+        MotionFileError, match="the joints of robots and simulated figures aren't read: give the person"
+    ):
+        read_motion(pickled(tmp_path / "a.pkl", clip))
+    np.savez(tmp_path / "a", **clip)
+    with pytest.raises(
+        MotionFileError, match="the joints of robots and simulated figures aren't read: give the person"
+    ):
+        read_motion(tmp_path / "a.npz")
+
+
 def test_a_place_of_the_pelvis_is_no_translation_of_the_mesh(tmp_path: Path) -> None:
     clip = {"pose_aa": POSES, "root_trans_offset": TRANSL + PELVIS, "fps": 30}
     np.testing.assert_allclose(read_motion(pickled(tmp_path / "a.pkl", clip)).transl, TRANSL, atol=1e-9)
