@@ -44,6 +44,8 @@ class Layout:
     """Numbers of joints or points, where they aren't SMPL's."""
     has_age: bool = False
     """Whether an eleventh beta is the share of a child (SMPL+A) instead of one more of the shape."""
+    genders: tuple[str, ...] = ()
+    """What a gender's number means, where genders are numbers."""
     turns_about_origin: bool = False
     """Whether the root turns the body about the origin of its mesh instead of its pelvis."""
 
@@ -106,6 +108,7 @@ LAYOUTS: tuple[Layout, ...] = (
         pose=("bodyPose",),
         transl=("bodyTranslation",),
         betas=("shapeParameters",),
+        genders=("neutral", "male", "female"),
         is_whole=False,
     ),
     Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
@@ -139,7 +142,9 @@ LENGTHS = "lengths"
 """How many frames each sample of a batch has; the rest is padding."""
 SCALINGS = ("smpl_scaling",)
 """AIST++'s translations are those of a body that is larger by this factor."""
-MODELS = ("surface_model_type",)
+MODELS = ("surface_model_type", "smplVersion")
+SMPLX_VERSION = "2"
+"""SMPL-X's number in Meshcapade's files."""
 
 SOMA_NAMES = "joint_names"
 _SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_coeffs")
@@ -186,7 +191,19 @@ def names_like(keys: Iterable[str | int]) -> Iterator[tuple[Layout, dict[str | i
                 key: _SPELLED.get(word.removeprefix(before), _SPELLED.get(word)) for word, key in by_spelling.items()
             }
             known |= {by_spelling[before + spelled(name)]: name for name in layout.pose}
-            yield layout, {key: name for key, name in known.items() if name not in (None, key)}
+            yield (
+                layout,
+                {
+                    key: name
+                    for key, name in known.items()
+                    if name not in (None, key) and not _is_known(key, name, layout)
+                },
+            )
+
+
+def _is_known(key: str | int, name: str, layout: Layout) -> bool:
+    """Whether a key is already one of the ways in which a name is spelled, as `frameRate` is."""
+    return key in ALL_KEYS and spelled(key) == spelled(name) and name not in layout.pose
 
 
 HUMANML_ADVICE = "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)"

@@ -145,9 +145,11 @@ def _recording(
             raise ValueError(f"{table.SCALINGS[0]} must be a number in [1e-6, 1e6], got {scaling.reshape(-1)[:1]}")
         transl = transl / scaling.flat[0]
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
+    model = word_of(content, first(above, table.MODELS))
     is_smplx = (
         any("smplx" in table.spelled(key) for key in like)
-        or "x" in word_of(content, first(above, table.MODELS))
+        or "x" in model
+        or model == table.SMPLX_VERSION
         or n_joints == _SMPLX_JOINTS
         or (layout.pose == table.OF_SMPLX and n_joints == _BODY_JOINTS)
     )
@@ -180,7 +182,9 @@ def _recording(
     if len(bad):
         where = f"{len(bad)} of {len(poses)}, first in number {bad[0]}"
         notes.append(f"NaN or infinite in {where}: nobody is dressed there")
-    gender = gender_of(word_of(content, first(above, table.GENDERS), which), notes)
+    word = word_of(content, first(above, table.GENDERS), which)
+    coded = dict(enumerate(layout.genders)).get(int(word) if word.isdecimal() else -1, word)
+    gender = gender_of(coded, notes)
     return Recording(sent, transl, betas, hertz, gender, tuple(notes))
 
 

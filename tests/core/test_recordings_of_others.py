@@ -16,6 +16,7 @@ from test_recordings import POSES, TRANSL, Z_UP, T, bvh, same, turned
 from msg_adapters import MotionFileError, read_motion
 from refu_core import load_body
 from refu_core.recordings import PELVIS
+from refu_core.recordings._upright import PELVIS_OF_SMPLX
 
 BETAS = np.linspace(-1, 1, 10)
 JOINTS = load_body("male")(POSES.astype(np.float32), transl=TRANSL.astype(np.float32)).joints.double().numpy()
@@ -235,3 +236,17 @@ def test_a_body_without_a_root_and_a_name(tmp_path: Path) -> None:
         np.save(tmp_path / "a", still)
         with pytest.raises(MotionFileError, match=r"may be 3 columns of a translation .* save them apart"):
             read_motion(tmp_path / "a.npy", fps=30)
+
+
+@pytest.mark.parametrize(("number", "gender"), [(0, "neutral"), (1, "male"), (2, "female")])
+def test_meshcapade_numbers_genders_and_bodies(tmp_path: Path, number: int, gender: str) -> None:
+    """Its second body is SMPL-X, whose pelvis is lower."""
+    arrays = {"bodyPose": POSES[:, :22], "bodyTranslation": TRANSL, "frameRate": np.float32(24)}
+    with (tmp_path / "a.smpl").open("wb") as file:
+        np.savez(file, smplVersion=np.int32(2), gender=np.int32(number), **arrays)
+    motion = read_motion(tmp_path / "a.smpl")
+    assert (motion.gender, motion.fps) == (gender, 24)
+    np.testing.assert_allclose(motion.transl, TRANSL + PELVIS_OF_SMPLX - PELVIS, atol=1e-9)
+    notes = "; ".join(motion.notes)
+    assert "SMPL-X's mesh has its pelvis 13 cm lower" in notes
+    assert "like names" not in notes
