@@ -9,7 +9,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._kernel_cache import guard, no_cache
+from refu_core.errors import RefuError
 
 Result = TypeVar("Result")
 
@@ -51,6 +52,17 @@ def _start_quietly() -> None:
 
 
 _start_quietly()
+
+
+class Unpicklable:
+    """Holds addresses of memory that Warp works in: no other process and no copy can have them."""
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        """Raises `RefuError`, for copies too."""
+        name = type(self).__name__
+        raise RefuError(
+            f"{name} can't be copied, pickled or sent to a process: make another one there, of the same arguments"
+        )
 
 
 def as_warp(tensor: Tensor, dtype: Any) -> Any:

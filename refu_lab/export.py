@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import count, islice
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -197,6 +197,17 @@ def _obj(meshes: Sequence[ExportMesh], frame: int) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
+def usd_names(names: Sequence[str]) -> list[str]:
+    """Names as USD requires them, of ASCII letters, digits and underscores; those that become alike are numbered."""
+    found: list[str] = []
+    for given in names:
+        plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in given)
+        plain = "_" * (not plain or plain[0].isdigit()) + plain
+        numbered = (f"{plain}_{k}" for k in count(2))
+        found.append(plain if plain not in found else next(name for name in numbered if name not in found))
+    return found
+
+
 def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDArray[np.float64]) -> None:
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, Vt
@@ -213,9 +224,8 @@ def _write_usd(meshes: Sequence[ExportMesh], path: Path, fps: float, origin: NDA
         stage.SetTimeCodesPerSecond(fps)
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(frames - 1)
-    for mesh in meshes:
-        name = "".join(c if c.isascii() and c.isalnum() else "_" for c in mesh.name)  # as USD requires it
-        prim = UsdGeom.Mesh.Define(stage, f"/person/{'_' * name[:1].isdigit()}{name}")
+    for mesh, name in zip(meshes, usd_names([mesh.name for mesh in meshes]), strict=True):
+        prim = UsdGeom.Mesh.Define(stage, f"/person/{name}")
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateDoubleSidedAttr(True)
         prim.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(mesh.faces)))

@@ -345,7 +345,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         )
         data = adapters.encode_diagnostics(statuses(report, self.settings, now), stamp_ns=self.now_ns())
         self._diagnostics.publish(data)
-        self.recording.put(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY, data, QOS)
+        self.recording.put(self._diagnostics.topic_name, adapters.DIAGNOSTIC_ARRAY, data, QOS)
 
     def _count_namesakes(self) -> int:
         """How many other nodes have this name: they answer each other's requests, and their topics mix."""

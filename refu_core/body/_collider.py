@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import IN_ROW, Repeated, as_warp, is_plain, recorded, refit, strips, torch_stream
+from refu_core._warp import IN_ROW, Repeated, Unpicklable, as_warp, is_plain, recorded, refit, strips, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import Anatomy, ColliderSettings
@@ -20,7 +20,7 @@ from refu_core.body._model import SmplBody
 _DEFAULT = ColliderSettings()
 
 
-class Collider:
+class Collider(Unpicklable):
     """Gives way where a posed body runs through itself, as flesh does; the pose stays.
 
     1. *Arms* that are inside the body by more than half of their thickness move aside as a whole (`Aside`).

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
+from refu_core._warp import Unpicklable, as_warp, ints, memory, recorded, torch_stream
 from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _state
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
@@ -52,7 +52,7 @@ class Resolution(NamedTuple):
         return float(self.numbers[3])
 
 
-class Resolver:
+class Resolver(Unpicklable):
     """Brings one garment off posed bodies.
 
     The steps: where an approximate distance has missed the closest face, a neighbour's face leads to it; vertices

@@ -82,10 +82,10 @@ class Posed(NamedTuple):
     """Rotation of each joint in the world, shape (24, 3, 3)."""
     joints: Array
     """[m], shape (24, 3)."""
-    moves: Array
-    """How a unit of each beta moves a joint and all that it carries [m], shape (24, 3, 10)."""
     points: Array
     """Keypoints [m], shape (K, 3)."""
+    moves: Array
+    """How a unit of each beta moves a keypoint [m], shape (K, 3, 10)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +118,14 @@ class Skeleton:
         above = np.maximum(_ABOVE, 0)
         bones, dirs = (given - given[above] for given in (proportions.joints, proportions.shapedirs))
         self._bones = np.concatenate([bones[:, :, None], dirs], axis=2)  # from its parent to each joint, and per beta
+        rest, slopes = (
+            np.tensordot(layout.places, given, 1) - given[layout.joints]
+            for given in (proportions.joints, proportions.shapedirs)
+        )
+        rest = rest + layout.offsets
+        self._beside = np.concatenate([rest[:, :, None], slopes], axis=2)  # from its joint to each keypoint, per beta
         carried = CARRIED[layout.joints]
-        carried[np.arange(len(layout)), layout.joints] *= layout.offsets.any(axis=1)
+        carried[np.arange(len(layout)), layout.joints] *= ~layout.is_joint
         self.turning = np.flatnonzero(carried.any(axis=0))
         """Joints that move a keypoint when they turn, shape (m,)."""
         self.carried = carried[:, self.turning]
@@ -146,8 +152,10 @@ class Skeleton:
         moves, turns = reach[:, :, 1:], turns[:N_JOINTS]
         joints = pose.pelvis + reach[:, :, 0] + moves @ pose.betas
         at = self.layout.joints
-        points = joints[at] + np.einsum("kij,kj->ki", turns[at], self.layout.offsets)
-        return Posed(turns, joints, moves, points)
+        beside = turns[at] @ self._beside
+        spread = moves[at] + beside[:, :, 1:]
+        points = joints[at] + beside[:, :, 0] + beside[:, :, 1:] @ pose.betas
+        return Posed(turns, joints, points, spread)
 
     def jacobian(self, posed: Posed, *, of_betas: bool) -> Array:
         """How keypoints move with the pelvis, with each joint of `turning` about its own axes, and betas if wanted.
@@ -158,7 +166,7 @@ class Skeleton:
         arms = posed.points[:, None] - posed.joints[self.turning]
         turns = (skew(self.carried[:, :, None] * -arms) @ posed.turns[self.turning]).swapaxes(1, 2)
         columns = [np.broadcast_to(_IDENTITY, (n, 3, 3)), turns.reshape(n, 3, 3 * m)]
-        columns += [posed.moves[self.layout.joints]] if of_betas else []
+        columns += [posed.moves] if of_betas else []
         return np.concatenate(columns, axis=2).reshape(3 * n, -1)
 
 

@@ -19,7 +19,17 @@ from numpy.typing import ArrayLike
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3
-from refu_core.keypoints._solver import BETAS, MEAN, N_PARTS, Solution, Solver, TrackerSettings, first_pose
+from refu_core.keypoints._solver import (
+    BETAS,
+    MEAN,
+    N_PARTS,
+    TURNS,
+    Solution,
+    Solver,
+    TrackerSettings,
+    first_pose,
+    twisted_wrongly,
+)
 
 DEFAULTS = TrackerSettings()
 
@@ -46,11 +56,13 @@ class KeypointTracker:
         self._settings = settings
         self._known = None if betas is None else np.asarray(betas, np.float64)
         self._solver = Solver(skeleton, fits_betas=betas is None, settings=settings)
-        joints, other = skeleton.layout.joints, skeleton.layout.mirrored
+        layout = skeleton.layout
+        joints, other = layout.joints, layout.mirrored
         self._sides = [np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS]
         power = [np.full(3, settings.push), np.full(3 * N_JOINTS, settings.twist), np.zeros(N_BETAS)]
         self._power = np.concatenate(power) / settings.smoothing**2
-        self._offset = settings.offset_noise * skeleton.layout.offsets.any(axis=1)
+        self._offset = np.where(layout.is_joint, 0.0, settings.offset_noise)
+        self._offset[~layout.is_sure] = settings.unsure_noise
         self.reset()
 
     def reset(self) -> None:
@@ -133,7 +145,7 @@ class KeypointTracker:
         is_percent = weights.max(initial=0.0) > _MOST_SCORE
         weights = np.minimum(weights / 100 if is_percent else weights, 1.0)
         here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
-        weights[~here | (weights < _LEAST)] = 0.0
+        weights[~here | (weights < _LEAST) | ~self.skeleton.layout.is_told] = 0.0
         return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
 
     # Beginnings -----------------------------------------------------------------------------------
@@ -235,8 +247,17 @@ class KeypointTracker:
         self._rate_variance = np.maximum(self._rate_variance - gain * self._mixed * shrunk, 0.0)
         self._mixed = gain * variance
         self._variance, self._pose = variance, after
+        self._untwist()
         self._seen_at = self._stamp
         self._learn_noise(seen, dt)
+
+    def _untwist(self) -> None:
+        """Turns limbs that bend the wrong way about their upper bones, rates with them."""
+        for ball, hinge, turn in twisted_wrongly(self._pose, self.skeleton.bones(self._pose.betas)):
+            turns, rates = self._pose.turns.copy(), self._rate[TURNS].reshape(N_JOINTS, 3)
+            turns[ball], turns[hinge] = turns[ball] @ turn, turn.T @ turns[hinge]
+            rates[ball] = turn.T @ rates[ball]
+            self._pose = Pose(self._pose.pelvis, turns, self._pose.betas)
 
     def _learn_noise(self, seen: _Seen, dt: float) -> None:
         """Adapts to the tracker's noise, by the median distance that is left after the fit."""

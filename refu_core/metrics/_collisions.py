@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import as_warp
+from refu_core._warp import Unpicklable, as_warp
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, as_points, check_faces, grouped
 from refu_core.metrics._intersect_kernels import intersect_kernel
@@ -162,7 +162,7 @@ class Collisions:
         return not self.n_pairs and not self.n_inside
 
 
-class CollisionChecker:
+class CollisionChecker(Unpicklable):
     """Exact check of garments against one body: set the body once per frame, then check each garment.
 
     Intersections are those of all pairs of triangles, decided in double precision on float32 vertices. Touching counts

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from refu_core._warp import Unpicklable
 from refu_core.body import Surface
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, vertex_normals
@@ -56,7 +57,7 @@ class SelfContact:
         return (away <= distance) | (np.isin(closest, self.faces) & is_within)
 
 
-class SelfContactDetector:
+class SelfContactDetector(Unpicklable):
     """Finds where a posed body intersects itself, its rest pose's own intersections (toes, ears) left out.
 
     Faces of a bending joint's crease (groin, armpit, the crook of a knee) that fold into each other count: skin that

@@ -28,6 +28,11 @@ _SMPL = "pelvis l_hip r_hip spine_low l_knee r_knee spine_mid l_ankle r_ankle sp
 _SMPL += "r_clavicle head l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist"
 SMPL_POINTS = tuple(_SMPL.split())
 """SMPL's joints that SMPL-H and SMPL-X also have, by their names in the keypoint layouts."""
+_OF_SMPL = {"pelvis": "smpl_pelvis", "spine_low": "smpl_spine1", "spine_mid": "smpl_spine2"}
+_OF_SMPL |= {"spine_high": "smpl_spine3", "neck": "smpl_neck", "head": "smpl_head"}
+_OF_SMPL |= {"l_clavicle": "l_smpl_collar", "r_clavicle": "r_smpl_collar"}
+_RAISED = 0.119
+"""How high SMPL's pelvis is above the middle of its hips, as a share of the legs; the built-in bodies' is at 0.006."""
 _BONES = (0.4, 2.5)
 """Least and greatest ratio of a bone's length to the mean body's, each taken as a share of the length of the legs."""
 _TRUNK = [SMPL_POINTS.index(name) - 1 for name in ("spine_low", "spine_mid", "spine_high", "neck")]
@@ -119,6 +124,25 @@ def _joined(bones: NDArray[np.float64]) -> NDArray[np.float64]:
     """Lengths of bones (..., n) with those of the trunk as one, for betas move its joints along it."""
     trunk = bones[..., _TRUNK].sum(axis=-1, keepdims=True)
     return np.concatenate((np.delete(bones, _TRUNK, axis=-1), trunk), axis=-1)
+
+
+def whose_joints(places: NDArray[np.float64], worn: Proportions | None) -> tuple[str, ...]:
+    """`SMPL_POINTS` as the points of the keypoint layouts that joints at `places` (T, n, 3) are.
+
+    They are those of the body `worn`, by default the neutral one, or of SMPL, whose trunk has its joints elsewhere.
+    """
+
+    def raised(joints: NDArray[np.float64]) -> float:
+        middle = joints[:, 1:3].mean(axis=1)
+        bones = [joints[:, 0] - middle, *(joints[:, a] - joints[:, b] for a, b in ((1, 4), (4, 7)))]
+        height, thigh, shank = np.nanmedian(np.linalg.norm(bones, axis=-1), axis=1)
+        return float(height / (thigh + shank))
+
+    own = raised((Proportions.builtin("neutral") if worn is None else worn).joints[None])
+    found = raised(places)
+    if abs(found - own) <= abs(found - _RAISED):
+        return SMPL_POINTS
+    return tuple(_OF_SMPL.get(point, point) for point in SMPL_POINTS)
 
 
 def metres_of(points: Sequence[str], places: NDArray[np.float64], notes: list[str]) -> float:

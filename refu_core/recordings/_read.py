@@ -17,7 +17,15 @@ from refu_core.recordings import _layouts as table
 from refu_core.recordings._bvh import read_bvh
 from refu_core.recordings._containers import Content, Key, open_content
 from refu_core.recordings._find import chosen, find_motion, first, person_of, with_known_names
-from refu_core.recordings._followed import MHR_POINTS, SMPL_POINTS, are_places, follow, metres_of, places_of_mhr
+from refu_core.recordings._followed import (
+    MHR_POINTS,
+    SMPL_POINTS,
+    are_places,
+    follow,
+    metres_of,
+    places_of_mhr,
+    whose_joints,
+)
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps, not_finite, tell_pace
 from refu_core.recordings._rotations import BODY, WHOLE, rotvecs_of
 from refu_core.recordings._soma import smpl_of_soma
@@ -135,7 +143,8 @@ def _recording(
         notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
         places = array[:, : len(SMPL_POINTS)].astype(np.float64)
         places = metres_of(SMPL_POINTS, places[0], notes) * places
-        return follow(SMPL_POINTS, places, fps=rate(), axes=axes, usual="smpl", worn=worn, notes=notes)
+        points = whose_joints(places, worn)
+        return follow(points, places, fps=rate(), axes=axes, usual="smpl", worn=worn, notes=notes)
     poses, n_joints = _poses(arrays, layout, node, notes)
     n = len(poses)
     transl = transl_of(one(layout.transl), layout, n, notes)

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, ints, memory
+from refu_core._warp import Repeated, Unpicklable, as_warp, ints, memory
 from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity
@@ -50,7 +50,7 @@ def ask(kernel: Repeated, points: Tensor, *more: Tensor) -> Found:
     return found
 
 
-class MeshSdf(ABC):
+class MeshSdf(Unpicklable, ABC):
     """A signed distance to faces of the posed body: subclasses find faces, exact first derivatives come from here."""
 
     is_exact = True

@@ -20,6 +20,7 @@ from refu_core.body._creases import _parting
 from refu_core.errors import MeshError
 from refu_core.metrics import SelfContactDetector
 from refu_core.realtime import Outfit
+from refu_core.sdf import Winding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -204,6 +205,26 @@ def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Coll
     torch.testing.assert_close(before[is_hand], after[is_hand], atol=1e-5, rtol=0)
     assert not torch.equal(rotation, skin.transforms.rotation)
     assert collider.shift(skin.vertices, aside, aside)[0, 3] == 0
+
+
+@pytest.mark.parametrize("turns", [*INSIDE.values(), {"left_shoulder": (0, 0, -1.5)}], ids=[*INSIDE, "fingertips"])
+def test_fingers_and_thumbs_are_wholly_outside(
+    turns: dict[str, tuple[float, float, float]], body: SmplBody, collider: Collider
+) -> None:
+    """Cloth can't follow a dent as narrow as a finger."""
+    aside = collider.anatomy.aside
+    start = torch.cat((aside._start, torch.tensor([len(aside._vertex)]))).tolist()
+    thin = [len(ARMS) + i for i in torch.nonzero(aside._clear).ravel().tolist()]
+    fingers = torch.cat([aside._vertex[start[i] : start[i + 1]] for i in thin])
+    assert (body.weights[fingers][:, [18, 19, 20, 21, 22, 23]].sum(1) > 0.5).all()
+    skin = body(pose=posed(body, turns))
+    went, _ = collider.aside(skin.vertices, skin.transforms.rotation)
+    winding, n_inside = Winding(aside._faces), []
+    for one in (skin.vertices[0], went[0]):
+        winding.update(torch.cat((one, aside._means(one)[aside._first_cap :])))
+        n_inside.append(int(torch.count_nonzero(winding(one[fingers]))))
+    assert n_inside[0] > 20
+    assert n_inside[1] <= 2
 
 
 def test_an_arm_that_is_too_deep_is_held(body: SmplBody, collider: Collider) -> None:

@@ -97,7 +97,7 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(subject: S
     """In world axes a turn made 11 cm of difference to a vertex of the mode hybrid, and 3 mm to one of accurate.
 
     With a network the rounding of gravity's direction is left, which may decide anew which way out of a limb is the
-    closest. Of 24 such frames 5 differ by more than the margin, one by 20 mm.
+    closest. Of 24 such frames 3 differ by more than the margin, one by 5 mm.
     """
     check = CHECKS["invariance: the person turned"]
     limits, deviations = [], []

@@ -18,9 +18,13 @@ import numpy as np
 import pytest
 import torch
 
-from refu_core import GarmentPipeline, RefuError, SmplFrame
+from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body
+from refu_core.body import Collider
+from refu_core.contact import Resolver
+from refu_core.metrics import CollisionChecker, SelfContactDetector
 from refu_core.realtime import Dressed, PipelineOutput
 from refu_core.realtime._frame import FrameStep
+from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf
 from refu_lab.stress._frames import everyday
 
 _GARMENTS = ("tshirt-male", "short-pant-male")
@@ -216,3 +220,13 @@ def test_a_batch_after_a_fork_is_dressed_by_one_thread() -> None:
 def _all_steps(pipeline: GarmentPipeline) -> list[FrameStep]:
     with contextlib.ExitStack() as stack:
         return [stack.enter_context(pipeline._crew.turn()) for _ in range(pipeline.threads)]
+
+
+def test_what_holds_memory_of_warp_says_that_it_cannot_leave_its_process() -> None:
+    body = load_body("male")
+    there = [ExactSdf(body.faces), BandSdf(body.faces), ApproxSdf(body), Resolver(body.faces, body.n_vertices)]
+    checkers = [CollisionChecker(body.faces), SelfContactDetector(body.faces, body.v_template), Collider(body)]
+    for one in [*there, *checkers]:
+        for leave in (pickle.dumps, copy.copy, copy.deepcopy):
+            with pytest.raises(RefuError, match=f"^{type(one).__name__} can't be copied"):
+                leave(one)

@@ -21,7 +21,7 @@ from refu_core.simulation import open_dataset, simulate_dataset
 from refu_core.training import PretrainSettings, pretrain
 from refu_lab.cli import main
 from refu_lab.commands.garment import AddOptions
-from refu_lab.export import ExportMesh, meshes_of, write_meshes
+from refu_lab.export import ExportMesh, meshes_of, usd_names, write_meshes
 from refu_lab.garment import add_garment, list_garments, warnings_of
 from refu_ros._settings import NodeSettings
 from tests.lab.test_own_body_commands import HURRIED
@@ -285,6 +285,11 @@ def test_a_usd_stage_moves(dressed: list[ExportMesh], tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), kilt.faces)
     texture = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()
     np.testing.assert_allclose(texture, kilt.uv.coordinates[kilt.uv.faces].reshape(-1, 2), atol=1e-6)
+
+
+def test_names_that_usd_makes_alike_stay_different() -> None:
+    given = ["a-b", "a_b", "a b", "a_b_2", "2-in-1", "été", ""]
+    assert usd_names(given) == ["a_b", "a_b_2", "a_b_3", "a_b_2_2", "_2_in_1", "_t_", "_"]
 
 
 def test_usd_without_its_library_is_said(dressed: list[ExportMesh], tmp_path: Path, monkeypatch) -> None:

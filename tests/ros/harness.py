@@ -34,7 +34,7 @@ from refu_ros._program import make_executor
 from tests.ros.ready import run_program
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from types import ModuleType
 
 ROOT = Path(__file__).parents[2]
@@ -61,10 +61,12 @@ class NodeProcess:
         first: str = "",
         packages: Path | None = None,
         namespace: str = "",
+        remaps: Sequence[str] = (),
         **parameters: Any,
     ) -> None:
         self._log = log
         given = [*ros_arguments(parameters), "-r", f"__ns:=/{namespace}"]
+        given += [word for remap in remaps for word in ("-r", remap)]
         path = [str(folder) for folder in (ROOT, packages) if folder is not None]
         cwd = log.parent  # of relative paths that a test or a hostile peer names
         self.process = run_program("garment_node", given, log=log, cwd=cwd, path=path, first=first)

@@ -80,6 +80,17 @@ def test_signals_lose_nothing(peer: Peer, tmp_path: Path, signals: tuple[signal.
     assert published <= garments <= inputs
 
 
+def test_topics_are_recorded_under_the_names_that_they_are_remapped_to(peer: Peer, tmp_path: Path) -> None:
+    bag, remaps = tmp_path / "bag", ("/diagnostics:=/robot/health",)
+    with NodeProcess(tmp_path / "log.txt", **CHEAP, record=bag, remaps=remaps) as node:
+        play(peer)
+        assert node.stop(signal.SIGINT) == 0, node.log
+    with BagReader(bag) as reader:
+        topics = {message.topic for message in reader.messages()}
+    assert "/robot/health" in topics
+    assert "/diagnostics" not in topics
+
+
 def test_a_lifecycle_shutdown_loses_nothing(peer: Peer, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     with NodeProcess(tmp_path / "log.txt", **CHEAP, record=bag) as node:
