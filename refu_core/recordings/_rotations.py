@@ -144,8 +144,8 @@ def _are_on_bones(vectors: Array) -> bool:
     if len(some) < _FEWEST or not (some.std(axis=0).max(axis=1) > _MOVES).all():
         return False
     ways = np.linalg.norm(some[:, :, None] - some[:, None], axis=-1)
-    change = ways.std(axis=0) + np.diag(np.full(some.shape[1], np.inf))
-    return bool((change <= _RIGID * ways.mean(axis=0)).any(axis=1).all())
+    length, change = ways.mean(axis=0), ways.std(axis=0)
+    return bool(((length > _MOVES) & (change < _RIGID * length)).any(axis=1).all())
 
 
 def _rotvecs(matrices: Array, name: str) -> Array:

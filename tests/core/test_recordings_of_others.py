@@ -194,6 +194,11 @@ def test_places_of_another_skeleton_are_not_taken_for_rotations(tmp_path: Path) 
             read_motion(tmp_path / f"{name}.npy", fps=30)
 
 
+def test_joints_that_turn_alike_are_no_places(tmp_path: Path) -> None:
+    np.save(tmp_path / "a", np.tile(np.sin(np.arange(T) / 9)[:, None, None] * [0.2, 0.1, 0.0], (1, 24, 1)))
+    assert "no betas" in "; ".join(read_motion(tmp_path / "a.npy", fps=30).notes)
+
+
 def test_names_of_places(tmp_path: Path) -> None:
     np.savez(tmp_path / "a", global_joint_positions=JOINTS[:, :22], height=1.8)
     notes = "; ".join(read_motion(tmp_path / "a.npz", fps=30).notes)
