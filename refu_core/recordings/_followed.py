@@ -84,7 +84,7 @@ def follow(
     pelvis = known_body.of(betas.astype(np.float64))[0]
     roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual=usual, pelvis=pelvis)
     poses[:, 0] = roots
-    tell_pace(transl, fps, notes)
+    tell_pace(transl, fps, notes, has_unit=True)
     is_fitted = worn is not None
     return Recording(
         poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes), is_fitted

@@ -220,6 +220,11 @@ def test_jumps_of_followed_people_are_told(tmp_path: Path) -> None:
     joints[T // 2 :] += [0, 0, 30]
     np.savez(tmp_path / "a", joints=joints, fps=30)
     assert "the person jumps by 30.0 m after frame 14" in "; ".join(read_motion(tmp_path / "a.npz").notes)
+    way = np.arange(T)[:, None, None] * [0.0, 0.0, 1.0]
+    np.savez(tmp_path / "a", joints=JOINTS + 100 + 3 * way, fps=30)
+    assert "m/s: is it 30 frames a second?" in "; ".join(read_motion(tmp_path / "a.npz").notes)
+    np.savez(tmp_path / "a", joints=JOINTS + 100, fps=30)
+    assert "the origin" not in "; ".join(read_motion(tmp_path / "a.npz").notes)
 
 
 @pytest.mark.parametrize("n", [66, 72])
