@@ -86,6 +86,7 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     if len(joints) > n_channels:  # joints that the file says nothing of would take memory in every frame
         raise ValueError(f"wanted at least as many channels as joints, got {n_channels} and {len(joints)}")
     numbers = np.array(motion[head.end() :].split(), dtype=np.float64)
+    count = count or numbers.size // n_channels  # programs that were stopped leave a zero there
     if not 0 < count <= MAX_FRAMES or numbers.size != count * n_channels or not np.isfinite(numbers).all():
         finite = int(np.isfinite(numbers).sum())
         msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
@@ -100,7 +101,7 @@ def _words(line: str) -> list[str]:
     """The words of a line, with a joint's name as one of them."""
     words = line.split()
     end = len(words) - (words[-1:] == ["{"])
-    if end < 3 or words[0] not in ("ROOT", "JOINT"):
+    if end < 3 or words[0].upper() not in ("ROOT", "JOINT"):
         return words
     return [words[0], "_".join(words[1:end]), *words[end:]]
 
@@ -110,9 +111,10 @@ def _joints(words: Iterator[str]) -> list[_Joint]:
     open_: list[int] = []
     try:
         for word in words:
-            if word in ("ROOT", "JOINT", "End"):
+            word = word.upper()
+            if word in ("ROOT", "JOINT", "END"):
                 name = next(words)
-                joints.append(_Joint("" if word == "End" else name, open_[-1] if open_ else -1, np.zeros(3)))
+                joints.append(_Joint("" if word == "END" else name, open_[-1] if open_ else -1, np.zeros(3)))
             elif word == "{":
                 open_.append(len(joints) - 1)
             elif word == "}":
@@ -193,7 +195,9 @@ def _points(joints: list[_Joint], places: Array) -> dict[str, int]:
     sides: dict[tuple[str, str], int] = {}
     for i, joint in enumerate(joints):
         if joint.name:
-            sides.setdefault(_sided(joint.name), i)
+            key = _sided(joint.name)
+            if len(joint.name) < len(joints[sides.setdefault(key, i)].name):  # beside L_Hip, Pelvis_L_Hip is a helper
+                sides[key] = i
     points: dict[str, int] = {}
     for part, names in _NAMES.items():
         for side in ("l", "r") if part in _SIDED else ("",):
@@ -203,9 +207,11 @@ def _points(joints: list[_Joint], places: Array) -> dict[str, int]:
                 points[f"{side}_{part}" if side else part] = found
     if "pelvis" not in points and (pelvis := _between(joints, places, points)) is not None:
         points["pelvis"] = pelvis
-    end = next((i for i, joint in enumerate(joints) if not joint.name and joint.parent == points.get("head")), None)
-    if end is not None:
-        points["head_top"] = end
+    ends = {joint.parent: i for i, joint in reversed(list(enumerate(joints))) if not joint.name}
+    bones = [(f"{side}_{a}", f"{side}_{b}") for side in "lr" for a, b in (("knee", "ankle"), ("elbow", "wrist"))]
+    for bearer, point in (*bones, ("head", "head_top")):
+        if point not in points and points.get(bearer) in ends:
+            points[point] = ends[points[bearer]]
     return points
 
 
@@ -231,11 +237,13 @@ def _sided(name: str) -> tuple[str, str]:
     """The side (`l`, `r` or empty) and the rest of a joint's name, in any of the ways that tools write them."""
     bare = re.sub(rf"(?i)(?<=.)[_. -](?:{_SUFFIXES})$", "", re.split(r"[:|]", name)[-1])
     match = re.fullmatch(r"(?i)(?:.*[_. -])?(left|right)[_. -]?(.+)", bare)
-    match = match or re.fullmatch(r"(?:.*[_. -])?([lLrR])(?:[_. -]|(?=[A-Z]))(.+)", bare)
+    at_end = None if match else re.fullmatch(r"(?i)(.+?)[_. -](left|right)", bare)
+    if not at_end:
+        match = match or re.fullmatch(r"(?:.*[_. -])?([lLrR])(?:[_. -]|(?=[A-Z]))(.+)", bare)
     if match:
         side, rest = match[1], match[2]
     else:
-        match = re.fullmatch(r"(?i)(.+?)[_. -](left|right|l|r)", bare) or re.fullmatch(r"(.+[a-z])(Left|Right)", bare)
+        match = at_end or re.fullmatch(r"(?i)(.+?)[_. -](l|r)", bare) or re.fullmatch(r"(.+[a-z])(Left|Right)", bare)
         rest, side = (match[1], match[2]) if match else (bare, "")
         rest = re.sub(r"^(?:[A-Za-z0-9]+[_-])+(?=[A-Za-z])", "", rest)
     rest = re.sub(r"[^a-z0-9]", "", rest.lower())

@@ -5,7 +5,7 @@ A file is recognised by the names of its arrays. How an array holds rotations is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,8 @@ SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".
 
 
 ROOT_PLACES = ("root_translation", "root_trans", "root_transl")
+PELVIS_PLACES = ("root_trans_offset", "root_trans_world", "root_trans_cam")
+"""Names of translations that are where the pelvis is, instead of how far the mesh is moved."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +44,8 @@ class Layout:
     """Numbers of joints or points, where they aren't SMPL's."""
     has_age: bool = False
     """Whether an eleventh beta is the share of a child (SMPL+A) instead of one more of the shape."""
+    genders: tuple[str, ...] = ()
+    """What a gender's number means, where genders are numbers."""
     turns_about_origin: bool = False
     """Whether the root turns the body about the origin of its mesh instead of its pelvis."""
 
@@ -88,20 +92,39 @@ LAYOUTS: tuple[Layout, ...] = (
     ),
     Layout(writers="HybrIK", pose=("pred_thetas",), transl=("transl",), betas=("pred_betas",)),
     Layout(writers="TRAM", pose=("pred_rotmat",), transl=("pred_trans",), betas=("pred_shape",)),
-    Layout(writers="PHC and other humanoid controllers", pose=("pose_aa",), transl=("trans_orig", "trans")),
+    Layout(
+        writers="GLAMR, in the world",
+        pose=("smpl_orient_world", "smpl_pose"),
+        transl=("root_trans_world",),
+        betas=("smpl_beta",),
+    ),
+    Layout(
+        writers="PHC and other humanoid controllers",
+        pose=("pose_aa",),
+        transl=("trans_orig", "trans", "root_trans_offset"),
+    ),
     Layout(
         writers="Meshcapade",
         pose=("bodyPose",),
         transl=("bodyTranslation",),
         betas=("shapeParameters",),
+        genders=("neutral", "male", "female"),
         is_whole=False,
     ),
     Layout(writers="MDM", pose=("thetas",), transl=("root_translation",), is_time_last=True),
     Layout(writers="WHAM, VIBE, CLIFF, in the camera", pose=("pose",), transl=("trans", "global_t", "transl")),
     Layout(writers="BEDLAM, in the camera", pose=("poses_cam",), transl=("trans_cam",)),
+    Layout(
+        writers="GLAMR, in the camera",
+        pose=("smpl_orient_cam", "smpl_pose"),
+        transl=("root_trans_cam",),
+        betas=("smpl_beta",),
+    ),
     Layout(writers="a body without its root", pose=("pose_body",), is_whole=False),
     Layout(writers="a body without its root", pose=("body_pose",), is_whole=False),
     Layout(writers="joints alone", pose=("joints",), is_whole=False, holds_places=True),
+    Layout(writers="joints alone", pose=("joint_positions",), is_whole=False, holds_places=True),
+    Layout(writers="whom a robot follows", pose=("smpl_joints",), is_whole=False, holds_places=True),
     Layout(writers="MDM's samples", pose=("motion",), is_whole=False, is_time_last=True, holds_places=True),
     MHR,
 )
@@ -119,7 +142,9 @@ LENGTHS = "lengths"
 """How many frames each sample of a batch has; the rest is padding."""
 SCALINGS = ("smpl_scaling",)
 """AIST++'s translations are those of a body that is larger by this factor."""
-MODELS = ("surface_model_type",)
+MODELS = ("surface_model_type", "smplVersion")
+SMPLX_VERSION = "2"
+"""SMPL-X's number in Meshcapade's files."""
 
 SOMA_NAMES = "joint_names"
 _SOMA = (SOMA_NAMES, "absolute_pose", "unit", "identity_model_type", "identity_coeffs")
@@ -148,14 +173,14 @@ COLUMN_WORDS = tuple(map(spelled, COLUMNS))
 _POSES = tuple(spelled(layout.pose[0]) for layout in LAYOUTS)
 
 
-def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
-    """Known names for those `keys` that are spelled differently or have a prefix; none where there is no pose.
+def names_like(keys: Iterable[str | int]) -> Iterator[tuple[Layout, dict[str | int, str]]]:
+    """Known names for those `keys` that are spelled differently or have a prefix, in every way that gives a pose.
 
     Trackers write `smpl_body_pose`, `globalOrient` and `Body-Pose`.
     """
     by_spelling = {spelled(key): key for key in keys}
     if not any(word.endswith(_POSES) for word in by_spelling):
-        return {}
+        return
     for layout in LAYOUTS:
         first, *others = map(spelled, layout.pose)
         for word in by_spelling:
@@ -166,8 +191,19 @@ def names_like(keys: Iterable[str | int]) -> dict[str | int, str]:
                 key: _SPELLED.get(word.removeprefix(before), _SPELLED.get(word)) for word, key in by_spelling.items()
             }
             known |= {by_spelling[before + spelled(name)]: name for name in layout.pose}
-            return {key: name for key, name in known.items() if name not in (None, key)}
-    return {}
+            yield (
+                layout,
+                {
+                    key: name
+                    for key, name in known.items()
+                    if name not in (None, key) and not _is_known(key, name, layout)
+                },
+            )
+
+
+def _is_known(key: str | int, name: str, layout: Layout) -> bool:
+    """Whether a key is already one of the ways in which a name is spelled, as `frameRate` is."""
+    return key in ALL_KEYS and spelled(key) == spelled(name) and name not in layout.pose
 
 
 HUMANML_ADVICE = "fit SMPL to its joints, or give them as keypoints (docs/guide/inputs.md)"
@@ -175,6 +211,8 @@ UNREAD = {
     ("mhr_model_params", "body_pose_params", "lbs_model_params", "identity_coeffs"): "MHR (SAM 3D Body) parameters "
     "aren't read: save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
     ("motion_feats", "new_joint_vecs"): f"HumanML3D features parameters aren't read: {HUMANML_ADVICE}",
+    ("dof", "dof_pos", "joint_vel", "qpos", "loop_mode", "skeleton_tree"): "the joints of robots and simulated figures "
+    "aren't read: give the person's motion that they were retargeted from",
     ("J_regressor",): "a body model's parameters aren't read: it is who wears the garments, and no motion: give it as "
     "--body (in Python: body=)",
 }

@@ -89,7 +89,9 @@ def _recording(
         notes.append(f"taken by like names: {', '.join(f'{key} as {name}' for key, name in like.items())}")
     found, above = find_motion(content, person, notes)
     layout, node = found.layout, found.node
-    arrays = {name: content.array(node[name]) for name in layout.pose}
+    own = {name: str(key) for key, name in like.items()}
+    arrays = {own.get(name, name): content.array(node[name]) for name in layout.pose}
+    shapes = [array.shape for array in arrays.values()]
     if layout.is_time_last:
         arrays = {name: np.moveaxis(array, -1, 0) for name, array in arrays.items()}
     if layout.holds_places:
@@ -103,11 +105,14 @@ def _recording(
     if layout.holds_places:
         lengths = content.array(node.get(table.LENGTHS, np.zeros(0)))
         is_told = n_persons and lengths.shape == (n_persons,) and lengths.dtype.kind in "iu"
-        n_lived = max(1, int(lengths[which])) if is_told else None
-        arrays = {name: _checked(array[:n_lived], name) for name, array in arrays.items()}  # the rest pads a batch
+        n_lived = max(1, int(lengths[which])) if is_told else None  # the rest pads a batch
+        arrays = {name: _checked(array[:n_lived], f"{name} {shapes[0]}") for name, array in arrays.items()}
+
+    def named(names: Sequence[str]) -> str | None:
+        return next((name for name in names if node.get(name) is not None), None)
 
     def one(names: Sequence[str]) -> NDArray[Any] | None:
-        name = next((name for name in names if node.get(name) is not None), None)
+        name = named(names)
         if name is None:
             return None
         array = content.array(node[name])
@@ -149,9 +154,11 @@ def _recording(
             raise ValueError(f"{table.SCALINGS[0]} must be a number in [1e-6, 1e6], got {scaling.reshape(-1)[:1]}")
         transl = transl / scaling.flat[0]
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
+    model = word_of(content, first(above, table.MODELS))
     is_smplx = (
         any("smplx" in table.spelled(key) for key in like)
-        or "x" in word_of(content, first(above, table.MODELS))
+        or "x" in model
+        or model == table.SMPLX_VERSION
         or n_joints == _SMPLX_JOINTS
         or (layout.pose == table.OF_SMPLX and n_joints == _BODY_JOINTS)
     )
@@ -161,6 +168,8 @@ def _recording(
     if is_smplx and betas.any() and not is_low:
         notes.append("betas are SMPL-X's: another shape space than SMPL's")
     theirs = PELVIS_OF_SMPLX if is_smplx and transl.any() and not is_low else pelvis
+    if named(layout.transl) in table.PELVIS_PLACES:
+        theirs, transl = pelvis, transl - pelvis
     if layout.turns_about_origin:
         transl = transl + Rotation.from_rotvec(poses[:, 0]).apply(theirs) - pelvis  # NaN for a root that is
     elif theirs is not pelvis:
@@ -182,7 +191,9 @@ def _recording(
     if len(bad):
         where = f"{len(bad)} of {len(poses)}, first in number {bad[0]}"
         notes.append(f"NaN or infinite in {where}: nobody is dressed there")
-    gender = gender_of(word_of(content, first(above, table.GENDERS), which), notes)
+    word = word_of(content, first(above, table.GENDERS), which)
+    coded = dict(enumerate(layout.genders)).get(int(word) if word.isdecimal() else -1, word)
+    gender = gender_of(coded, notes)
     return Recording(sent, transl, betas, hertz, gender, tuple(notes))
 
 
@@ -197,7 +208,7 @@ def _by_time(array: NDArray[Any]) -> NDArray[Any]:
 
 def _checked(array: NDArray[Any], name: str) -> NDArray[Any]:
     if not _is_of_places({name: array}):
-        msg = f"{name} {array.shape}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
+        msg = f"{name}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
         raise ValueError(msg)
     return array
 

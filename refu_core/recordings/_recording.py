@@ -80,8 +80,11 @@ def not_finite(poses: NDArray[np.floating], transl: NDArray[np.floating]) -> NDA
     return np.flatnonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(transl).all(axis=1)))
 
 
-def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> None:
-    """Adds a note if translations (T, 3) [m], at `rate` frames a second, can't be one person's in metres."""
+def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str], *, has_unit: bool = False) -> None:
+    """Adds a note if translations (T, 3) [m], at `rate` frames a second, can't be one person's in metres.
+
+    Whose legs have shown the unit (`has_unit`) may be anywhere.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         steps, away = np.linalg.norm(np.diff(transl, axis=0), axis=1), np.linalg.norm(transl, axis=1)
     is_known, away = np.isfinite(steps), away[np.isfinite(away)]
@@ -90,7 +93,9 @@ def tell_pace(transl: NDArray[np.float64], rate: float, notes: list[str]) -> Non
     jumps = np.flatnonzero(is_known & (steps > max(_JUMP, FASTEST / rate)))
     if pace > FASTEST and far <= _FARTHEST and _is_to_and_fro(transl, pace / rate):
         notes.append(f"the person jumps to and fro by {pace / rate:.1f} m: {_OF_OTHERS}")
-    elif pace > FASTEST or far > _FARTHEST:
+    elif has_unit and pace > FASTEST:
+        notes.append(f"the person moves by {pace:.1f} m/s: is it {rate:g} frames a second?")
+    elif not has_unit and (pace > FASTEST or far > _FARTHEST):
         notes.append(
             f"the person moves by {pace:.1f} m/s, {far:.0f} m from the origin: divide the translation by 100 or 1000 "
             "if it is in cm or mm"

@@ -28,6 +28,15 @@ _ADVICE = {
 """What arrays of so many columns may be; the order of the columns differs between programs, so it isn't guessed."""
 LONGEST_TURN = 2 * np.pi + 0.1
 """An unwrapped rotation vector may be this long [rad]; the median of sound ones is never longer."""
+_FEWEST_HINGES, _STRAY = 10, 1e-6
+"""A robot turns at least this many joints [1], and none of them by more than this about a second axis [rad]."""
+_ENOUGH, _FEW, _FEWEST = 1000, 100, 3
+"""Frames that show how limbs bend, frames that show whether there are bones, and the fewest that do [1]."""
+_MOVES, _RIGID = 0.01, 0.01
+"""Places move by this much, in any unit, and their bones' lengths change by a smaller share [1]. In rotations of
+people, some joint's share is 0.06 at least."""
+_HUGE = 1e6
+"""Frames with larger numbers show neither [1]; their squares may overflow."""
 _MOST_SKEW = 0.05  # largest entry of R Rᵀ - I: 16-bit floats have 0.001, networks that don't project 0.01
 _MOST_UNEVEN = 0.3  # mean deviation of raw network output from two orthonormal vectors; anything else has 0.5 at least
 
@@ -46,6 +55,11 @@ def rotvecs_of(
         raise ValueError(f"{name} {array.shape} looks like quaternions, whose order a file doesn't say; {hint}")
     if size == 3:
         _check_radians(numbers, name)
+        if n > 1 and _are_on_bones(numbers):
+            what = f"{name} {array.shape} holds places of joints, in another order than SMPL's"
+            raise ValueError(
+                f"{what}: save them as joints, in SMPL's order, or give them as keypoints (docs/guide/inputs.md)"
+            )
         return numbers, n
     if size == 9:
         matrices = numbers.reshape(frames, n, 3, 3)
@@ -53,6 +67,15 @@ def rotvecs_of(
     else:
         matrices = _of_six(numbers, name, notes, first=0 if has_root else 1)
     return _rotvecs(matrices, name), n
+
+
+def are_hinges(array: NDArray[Any]) -> bool:
+    """Whether rotation vectors (T, n, 3) or (T, 3n), the root first, are a robot's: no joint turns about two axes."""
+    is_flat = array.ndim == 2 and array.shape[1] % 3 == 0
+    if array.dtype.kind != "f" or not (is_flat or (array.ndim == 3 and array.shape[2] == 3)) or not array.size:
+        return False
+    n_axes = (np.abs(array.reshape(len(array), -1, 3)[:, 1:]) > _STRAY).any(axis=0).sum(axis=1)
+    return bool(n_axes.max(initial=0) == 1 and n_axes.sum() >= _FEWEST_HINGES)
 
 
 def is_one_frame(shape: tuple[int, ...], counts: Collection[int]) -> bool:
@@ -112,6 +135,17 @@ def _check_radians(vectors: Array, name: str) -> None:
     if longest.size and float(np.median(longest)) > LONGEST_TURN:
         what = f"{name} has rotation vectors as long as {np.median(longest):.0f} in most frames"
         raise ValueError(f"{what}, wanted radians, 6.3 at most; where they are degrees, save np.radians of them")
+
+
+def _are_on_bones(vectors: Array) -> bool:
+    """Whether vectors (T, n, 3) are places: each moves, but stays as far from another one, as the ends of bones do."""
+    some = vectors[:: len(vectors) // _FEW + 1]
+    some = some[(np.abs(some) < _HUGE).all(axis=(1, 2))]
+    if len(some) < _FEWEST or not (some.std(axis=0).max(axis=1) > _MOVES).all():
+        return False
+    ways = np.linalg.norm(some[:, :, None] - some[:, None], axis=-1)
+    length, change = ways.mean(axis=0), ways.std(axis=0)
+    return bool(((length > _MOVES) & (change < _RIGID * length)).any(axis=1).all())
 
 
 def _rotvecs(matrices: Array, name: str) -> Array:
@@ -175,6 +209,14 @@ def _completed(a: Array, b: Array) -> Array:
     b = b - (x * b).sum(axis=-1, keepdims=True) * x
     y = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), tiny)
     return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+def flexion_of(vectors: NDArray[Any], *, first: int) -> float:
+    """How far knees and elbows bend the way they can [rad], in rotation vectors (T, 3n); `first` as in `_of_six`."""
+    some = vectors[:: len(vectors) // _ENOUGH + 1].astype(np.float64)
+    some = some[(np.abs(some) < _HUGE).all(axis=1)]
+    matrices = Rotation.from_rotvec(some.reshape(-1, 3)).as_matrix()
+    return _flexion(matrices.reshape(len(some), vectors.shape[1] // 3, 3, 3), first)
 
 
 def _flexion(matrices: Array, first: int) -> float:

@@ -12,9 +12,10 @@ from refu_core.frames import MAX_ANGLE
 
 Array = NDArray[np.float64]
 
-Axes = Literal["auto", "smpl", "z-up", "y-down", "frame"]
+Axes = Literal["auto", "smpl", "z-up", "y-down", "z-down", "frame"]
 """What root orientations and translations are expressed in: `smpl` (y up), `z-up` (AMASS, ROS), `y-down` (a camera's
-optical frame). `auto` judges by the people; `frame` leaves the numbers as they are, whatever they mean."""
+optical frame), `z-down` (Motion-X). `auto` judges by the people; `frame` leaves the numbers as they are, whatever they
+mean."""
 AXES: tuple[Axes, ...] = get_args(Axes)
 
 PELVIS = np.array([0.0, -0.22, 0.02])
@@ -25,7 +26,10 @@ PELVIS_OF_SMPLX = np.array([0.003, -0.351, 0.012])
 _TURNS: dict[str, Array] = {
     "z-up": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),  # as vertices_smpl_from_ros, so nothing changes in ROS axes
     "y-down": np.diag([1.0, -1, -1]),
+    "z-down": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
 }
+_BY_AXIS: dict[str, Axes] = {"+y": "smpl", "+z": "z-up", "-y": "y-down", "-z": "z-down"}
+_SAID = {"+z": "z up", "-y": "y down, as a camera has it", "-z": "z down, as Motion-X has it"}
 _CLEAR = 0.6
 """An axis is up if the mean of the up vectors is at least this long along it. People who walk, reach and squat have
 0.9 and more; a clip with a quarter of its time on the floor still has 0.7."""
@@ -65,7 +69,7 @@ def axis_of(roots: Array) -> str:
 
 def upright_turn(roots: Array) -> Array:
     """The rotation (3, 3) to SMPL's axes from the axes that people stand in; the identity if these aren't clear."""
-    return _TURNS.get({"+z": "z-up", "-y": "y-down"}.get(axis_of(roots), ""), np.eye(3))
+    return _TURNS.get(_BY_AXIS.get(axis_of(roots), ""), np.eye(3))
 
 
 def turn_from(up: Array) -> Array:
@@ -86,10 +90,9 @@ def to_smpl(
     lies = False
     if axes == "auto":
         axis = axis_of(roots)
-        chosen = {"+y": "smpl", "+z": "z-up", "-y": "y-down"}.get(axis, usual)
-        if axis in ("+z", "-y"):
-            what = "z up" if axis == "+z" else "y down, as a camera has it"
-            notes.append(f"the person stands along {axis}: taken as {what} (--input-axes says it otherwise)")
+        chosen = _BY_AXIS.get(axis, usual)
+        if axis in _SAID:
+            notes.append(f"the person stands along {axis}: taken as {_SAID[axis]} (--input-axes says it otherwise)")
         elif axis != "+y":
             seen = f"the person lies along {axis}" if axis else "it doesn't show which way is up"
             notes.append(f"{seen}: taken as {'y' if chosen == 'smpl' else 'z'} up (--input-axes says it otherwise)")

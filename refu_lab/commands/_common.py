@@ -215,8 +215,8 @@ def axes_of(what: str, frame: str) -> Any:
     return setting(
         "auto",
         f"axes of the {what} root: inferred from the people, and reported (auto); y up (smpl); z-up (AMASS); y-down (a "
-        f"camera); or {frame} (frame)",
-        choices=("auto", "smpl", "z-up", "y-down", "frame"),
+        f"camera); z-down (Motion-X); or {frame} (frame)",
+        choices=("auto", "smpl", "z-up", "y-down", "z-down", "frame"),
     )
 
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from msg_adapters import Motion, MotionFileError, iter_smpl_frames, read_motion
 from refu_core import load_body
-from refu_core.recordings import axis_of, upright_turn
+from refu_core.recordings import Axes, axis_of, upright_turn
 from refu_core.simulation import SimulationError, load_clips
 from refu_core.skeleton import JOINT_NAMES, PARENTS
 from tests.limits import refusal, run_limited
@@ -30,7 +30,8 @@ ROOT = Path(__file__).parents[2]
 T = 30
 Z_UP = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])  # y up to z up: (x, y, z) to (z, x, y)
 CAMERA = Rotation.from_euler("x", 180, degrees=True)
-LYING = Rotation.from_euler("x", -90, degrees=True)
+Z_DOWN = Rotation.from_euler("x", -90, degrees=True)
+LYING = Rotation.from_euler("z", -90, degrees=True)
 
 
 @cache
@@ -100,8 +101,15 @@ def test_forms(tmp_path: Path, form: str) -> None:
         assert "no translation" in "; ".join(motion.notes)
 
 
-@pytest.mark.parametrize(("turn", "note"), [(Z_UP, "+z: taken as z up"), (CAMERA, "-y: taken as y down")])
-def test_axes_are_seen_and_said(tmp_path: Path, turn: Rotation, note: str) -> None:
+@pytest.mark.parametrize(
+    ("axes", "turn", "note"),
+    [
+        ("z-up", Z_UP, "+z: taken as z up"),
+        ("y-down", CAMERA, "-y: taken as y down"),
+        ("z-down", Z_DOWN, "-z: taken as z down"),
+    ],
+)
+def test_axes_are_seen_and_said(tmp_path: Path, axes: Axes, turn: Rotation, note: str) -> None:
     body = load_body("male", dtype=torch.float64)
     path = save(tmp_path / "a.npz", poses=turned(POSES, turn), trans=TRANSL, betas=np.ones(10))
     motion, left = read_motion(path), read_motion(path, axes="frame")
@@ -114,14 +122,14 @@ def test_axes_are_seen_and_said(tmp_path: Path, turn: Rotation, note: str) -> No
     np.testing.assert_allclose(ours, turn.inv().apply(theirs.reshape(-1, 3)).reshape(ours.shape), atol=6e-3)
     (clip,) = load_clips(path)
     np.testing.assert_array_equal(clip.poses, motion.poses)
-    explicit = read_motion(path, axes="z-up" if turn is Z_UP else "y-down")
+    explicit = read_motion(path, axes=axes)
     np.testing.assert_array_equal(explicit.poses, motion.poses)
     assert explicit.notes == ()
 
 
 def test_who_lies_is_never_silent(tmp_path: Path) -> None:
     path = save(tmp_path / "a.npz", poses=turned(POSES, LYING), trans=TRANSL, betas=np.zeros(10))
-    assert any("lies along -z" in note for note in read_motion(path).notes)
+    assert any("lies along +x" in note for note in read_motion(path).notes)
     assert any("upright in 0 %" in note for note in read_motion(path, axes="smpl").notes)
     tilted = turned(POSES, Rotation.from_euler("x", 40, degrees=True))
     assert any("leans by" in note for note in read_motion(save(path, poses=tilted, trans=TRANSL)).notes)
