@@ -30,6 +30,7 @@ from refu_core.keypoints._solver import (
     first_pose,
     twisted_wrongly,
 )
+from refu_core.skeleton import JOINT_NAMES
 
 DEFAULTS = TrackerSettings()
 
@@ -111,6 +112,7 @@ class KeypointTracker:
             self._correct(sided, dt)
             if max(self._unfit_for, self._swapped_for) > self._settings.doubt:
                 self._begin_again(seen)
+            self._unwind(seen)
         if 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             self.reset()
         return self.at(stamp_ns)
@@ -188,6 +190,13 @@ class KeypointTracker:
         self._swapped_for = self._unfit_for = 0.0
         guess = self._guessed(seen)
         if guess is not None and guess[2] < 0.7 * self._misfit(self._pose, seen):
+            self._take(*guess)
+
+    def _unwind(self, seen: _Seen) -> None:
+        """Starts again from this frame alone if a spine is wound up, as after a cut at which somebody turned."""
+        wound = _wound(self._pose)
+        guess = self._guessed(seen) if wound > _WOUND else None
+        if guess is not None and _wound(guess[0]) < wound:
             self._take(*guess)
 
     def _misfit(self, pose: Pose, seen: _Seen) -> float:
@@ -278,8 +287,16 @@ class KeypointTracker:
         )
 
 
+def _wound(pose: Pose) -> float:
+    """How far the joints of the spine turn together [rad]."""
+    return float(np.linalg.norm(log_so3(pose.turns[_SPINE]), axis=1).sum())
+
+
 _GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
 """Joints of arms, legs and head, whose keypoints trackers exchange together."""
+_WOUND = 2.2
+"""The joints of a spine rarely turn by more than this together [rad]: deep bends have 1.8."""
+_SPINE = [JOINT_NAMES.index(f"spine{i}") for i in (1, 2, 3)]
 _FASTEST = np.concatenate([np.full(3, 12.0), np.full(3 * N_JOINTS, 40.0), np.zeros(N_BETAS)])
 """No pelvis [m/s] and no joint [rad/s] is faster than this."""
 _LEAST = 0.05

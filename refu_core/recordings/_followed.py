@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.frames import SmplFrame
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, layout_of
 from refu_core.recordings._recording import Recording, tell_pace
 from refu_core.recordings._upright import Axes, to_smpl
-from refu_core.skeleton import JOINT_NAMES, PARENTS
+from refu_core.skeleton import PARENTS
 
 _FIT = 100  # frames that a person's shape is taken from
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
@@ -36,9 +35,6 @@ _RAISED = 0.119
 _BONES = (0.4, 2.5)
 """Least and greatest ratio of a bone's length to the mean body's, each taken as a share of the length of the legs."""
 _TRUNK = [SMPL_POINTS.index(name) - 1 for name in ("spine_low", "spine_mid", "spine_high", "neck")]
-_WOUND = 2.2
-"""The joints of a spine rarely turn by more than this together [rad]: deep bends have 1.8."""
-_SPINE = [JOINT_NAMES.index(f"spine{i}") for i in (1, 2, 3)]
 _NOTHING = 1e-3  # least length of the legs, in the file's unit: bodies of zeros have none
 
 N_KEYPOINTS = 70
@@ -78,7 +74,7 @@ def follow(
             raise ValueError("its joints are in no order that a person's are in")
         betas = np.median(known, axis=0)
     track = KeypointTracker(skeleton, betas=betas)
-    frames = [_updated(track, place, round(1e9 * i / fps)) for i, place in enumerate(places)]
+    frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
     poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
     transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
     pelvis = known_body.of(betas.astype(np.float64))[0]
@@ -89,15 +85,6 @@ def follow(
     return Recording(
         poses.astype(np.float32), transl, betas.astype(np.float32), fps, "neutral", tuple(notes), is_fitted
     )
-
-
-def _updated(track: KeypointTracker, place: NDArray[np.float64], stamp_ns: int) -> SmplFrame | None:
-    """The next frame. Where a clip is cut, somebody who turns at once may be wound up: then the track begins anew."""
-    frame = track.update(place, stamp_ns)
-    if frame is not None and np.linalg.norm(frame.pose[_SPINE], axis=1).sum() > _WOUND:
-        track.reset()
-        frame = track.update(place, stamp_ns)
-    return frame
 
 
 def are_places(array: NDArray[np.float64]) -> bool:
