@@ -406,7 +406,8 @@ def test_whatever_comes_a_pose_is_finite(messages: list[tuple[Array, Array, int]
         try:
             track.update(points, stamp, confidence=confidence)  # a SmplFrame is finite, or an error
         except FrameError as error:
-            assert "wanted metres" in str(error)
+            if "wanted metres" not in str(error):
+                raise
         track.at(stamp + 10**8)
 
 
