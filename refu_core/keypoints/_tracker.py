@@ -147,10 +147,9 @@ class KeypointTracker:
         here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
         weights[~here | (weights < _LEAST) | ~self.skeleton.layout.is_told] = 0.0
         seen = given[weights > 0]
-        apart = np.median(np.linalg.norm(seen - np.median(seen, axis=0), axis=1)) if len(seen) else 0.0
-        if apart > _FARTHEST:
-            msg = f"a person's keypoints are {apart:.0f} m from their middle in the median, wanted metres"
-            raise FrameError(f"{msg}: does the tracker send millimetres or centimetres?")
+        if len(seen) and np.median(np.linalg.norm(seen - np.median(seen, axis=0), axis=1)) > _FARTHEST:
+            msg = f"most of a person's keypoints are over {_FARTHEST:g} m from their middle, wanted metres"
+            raise FrameError(f"{msg}: does the tracker send millimetres or centimetres?")  # alike for every frame
         return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
 
     # Beginnings -----------------------------------------------------------------------------------
