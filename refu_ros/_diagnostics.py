@@ -97,7 +97,7 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
         (silent_for is None and waited > _FIRST_INPUT_S, WARN, "no input yet"),
         (n := recent["back_in_time"], WARN, f"{n} stamps went back: {_WENT_BACK}"),
     ]
-    if missing and silent_for is not None and waited > _FIRST_INPUT_S:
+    if missing and not recent["skip.unwatched"] and silent_for is not None and waited > _FIRST_INPUT_S:
         nobody = received and not persons
         rules.append((True, WARN, f"nobody is here, though {received} messages came" if nobody else silence))
     if now.is_untransformed and now.input_frame:

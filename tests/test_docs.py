@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from refu_core.skeleton import JOINT_NAMES
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md")])
@@ -115,6 +117,13 @@ def test_the_readme_shows_the_results() -> None:
             value = parts["all", method, metric]
             wrong += [(row, metric, cell, value)] if not says(cell, value) else []
     assert wrong == []
+
+
+def test_the_node_s_page_names_the_joints_in_their_order() -> None:
+    (listed,) = re.findall(
+        r"^The joints, in SMPL's order, are (.*?)\. So", (DOCS / "guide/ros.md").read_text(), re.S | re.M
+    )
+    assert tuple(re.findall(r"`(\w+)`", listed)) == JOINT_NAMES
 
 
 def test_named_files_exist() -> None:

@@ -753,6 +753,13 @@ def test_messages_with_nobody_in_them_are_no_silence() -> None:
     assert report_of(statistics, persons=())["input"].message.startswith("no input for")
 
 
+def test_people_whom_nobody_watches_are_not_missed() -> None:
+    statistics = Statistics()
+    statistics.receive()
+    statistics.count("skip.unwatched")
+    assert report_of(statistics, persons=())["input"].level == 0
+
+
 @pytest.mark.parametrize(
     ("given", "persons", "message"),
     [

@@ -99,6 +99,9 @@ def _choose(path: Path, topics: Sequence[TopicInfo], name: str | None, kinds: Se
         msg = f"{path}: {len(found)} topics could carry the body: {_listing(found)}; choose one by topic"
     else:
         msg = f"{path}: no SMPL topic; the bag has {_listing(topics)}, wanted a topic of {wanted}"
+        markers = KEYPOINT_TYPES["keypoint_markers"]
+        if any((one.name.rsplit("/", 1)[-1], one.message_type) == (SMPL_TOPIC, markers) for one in topics):
+            msg += f"; for keypoints in {SMPL_TOPIC} set the input type to keypoint_markers"
     raise BagError(msg)
 
 

@@ -91,7 +91,7 @@ class KeypointTracker:
             confidence: from 0 to 1, shape (K,); NaN and negative numbers count as 0. In a frame that has one above 2,
                 all are out of 100.
 
-        Raises `FrameError`: another number of keypoints, or values that aren't numbers.
+        Raises `FrameError`: another number of keypoints, values that aren't numbers, or that can't be metres.
         """
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
@@ -148,6 +148,10 @@ class KeypointTracker:
         weights = np.minimum(weights / 100 if is_percent else weights, 1.0)
         here = np.isfinite(given).all(axis=1) & (np.abs(given) < 1e6).all(axis=1)
         weights[~here | (weights < _LEAST) | ~self.skeleton.layout.is_told] = 0.0
+        seen = given[weights > 0]
+        if len(seen) and np.median(np.linalg.norm(seen - np.median(seen, axis=0), axis=1)) > _FARTHEST:
+            msg = f"most of a person's keypoints are over {_FARTHEST:g} m from their middle, wanted metres"
+            raise FrameError(f"{msg}: does the tracker send millimetres or centimetres?")  # alike for every frame
         return _Seen(np.where(weights[:, None] > 0, given, 0.0), weights)
 
     # Beginnings -----------------------------------------------------------------------------------
@@ -303,6 +307,8 @@ _LEAST = 0.05
 """A confidence below this counts as none."""
 _MOST_SCORE = 2.0
 """Detectors that score by the height of a heat map go a little beyond 1; scores above this are per cent."""
+_FARTHEST = 3.0
+"""No person's keypoints are farther than this from their middle, in the median [m]: they are in another unit."""
 _FITS = 0.04
 """A first pose that misses its keypoints by less than this [m] has its sides right."""
 _NEAR, _FAR = 0.1, 0.5

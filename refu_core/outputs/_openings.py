@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.body import ARMS, LEGS, joints_of
+from refu_core.errors import MeshError, require_type
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import as_points, rim_of
 
@@ -194,7 +195,11 @@ class Openings:
     """
 
     def __init__(self, garment: GarmentTemplate) -> None:
-        """For any garment, the project's or a user's own; one without a boundary has no openings."""
+        """For any garment, the project's or a user's own; one without a boundary has no openings.
+
+        Raises `MeshError` for anything else, such as a mesh that it is worn as.
+        """
+        require_type(garment, GarmentTemplate, "a garment, as pipeline.garments[name]", error=MeshError)
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
         rings = rings_of(garment)

@@ -112,7 +112,8 @@ def _of_poses(dataset: GarmentDataset) -> SampleSet:
 def _of_bag(path: Path) -> SampleSet:
     names = garments_of(path)
     if len(names) != 1:
-        raise RefuError(f"{path}: wanted the ground truth of one garment, got {', '.join(names) or 'none'}")
+        msg = f"{path}: wanted the ground truth of one garment, got {', '.join(names) or 'none'}"
+        raise RefuError(f"{msg}: refu simulate makes it; refu replay --report measures a recording without")
     moments = moments_of(path, load_garment(names[0]))
 
     def read(number: int) -> Sample:

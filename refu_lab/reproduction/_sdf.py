@@ -98,7 +98,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
             pose = posture(title)
             for sample in list(bodies.values())[:_FOLDED_SHAPES]:
                 scene = SampleScene(setup, pose, sample.betas, sample.style)
-                unposed = setup.template.rest(scene.betas, scene.style)
+                unposed = setup.template.rest(scene.betas, setup.template.own(scene.style))
                 questions.ask(scene, setup.template.pose(unposed, scene.transforms)[0])
             for name, answers in questions.answers().items():
                 table.add(garment, f"{name}, {title}", _close_errors(*answers))

@@ -347,6 +347,11 @@ def test_bags_without_a_body(tmp_path: Path, every_type: Path) -> None:
         bag.write("/diagnostics", encode_diagnostics([], stamp_ns=0), log_time_ns=0)
     with pytest.raises(BagError, match=r"no SMPL topic; the bag has /diagnostics \(diag.*wanted a topic of std_msgs"):
         open_smpl_bag(tmp_path / "none")
+    with BagWriter(tmp_path / "markers") as bag:
+        bag.add_topic("/ann/smpl_params", MARKER_ARRAY)
+        bag.write("/ann/smpl_params", bytes([0, 1, 0, 0, 0, 0, 0, 0]), log_time_ns=0)
+    with pytest.raises(BagError, match="for keypoints in smpl_params set the input type to keypoint_markers"):
+        open_smpl_bag(tmp_path / "markers")
     BagWriter(tmp_path / "empty").finish()
     with pytest.raises(BagError, match="no message in this bag"):
         open_smpl_bag(tmp_path / "empty")
@@ -568,7 +573,7 @@ def test_overwriting_touches_nothing_but_a_bag(tmp_path: Path) -> None:
     file, directory = tmp_path / "a.mcap", tmp_path / "b"
     for path in (file, directory):
         write_bag(path, count=3)
-        with pytest.raises(BagError, match=r"choose another path, or overwrite it"):
+        with pytest.raises(BagError, match=r"choose another path, or --overwrite it"):
             write_bag(path)
         write_bag(path, count=2, overwrite=True)
         assert len(list(iter_smpl_frames(path))) == 2

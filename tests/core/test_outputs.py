@@ -242,6 +242,11 @@ def test_a_garment_that_planners_cannot_have_keeps_no_other_from_them() -> None:
     assert len(sent) == 1
 
 
+def test_openings_are_those_of_a_garment() -> None:
+    with pytest.raises(MeshError, match=r"wanted a garment, as pipeline.garments\[name\], got str"):
+        Openings("tshirt-male")  # type: ignore[arg-type]
+
+
 def test_a_planners_mesh_of_fewer_triangles() -> None:
     coarse = PlannerMesh(SHORTS, 400, half_thickness=0.01)
     assert len(coarse.faces) <= 400

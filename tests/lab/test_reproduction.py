@@ -330,6 +330,17 @@ def test_distance_table(samples: _runs.SampleSet) -> None:
     assert next(row.paper for row in table.rows if row.method == "neural") == 2.46
 
 
+def test_distance_table_of_a_garment_of_one_style() -> None:
+    name, body = "tshirt-neutral", load_body("neutral")
+    assert load_garment(name).styledirs is None
+    pose, betas, style = np.zeros((24, 3), np.float32), np.zeros(10, np.float32), np.zeros(4, np.float32)
+    posed = body(torch.from_numpy(pose)[None]).transforms
+    vertices = load_garment(name).pose(load_garment(name).v_template[None], posed)[0].numpy()
+    sample = _runs.Sample(vertices, pose, betas, style, float("nan"))
+    table = _sdf.sdf_table([_runs.SampleSet(name, 1, None, lambda _: sample)], library=_methods.Library())
+    assert table.value(name, "approx", "mean_absolute_mm") < 2
+
+
 def test_sequence_table_has_both_numbers_of_shapes(samples: _runs.SampleSet) -> None:
     study = _runs.Study()
     _runs.run_methods(study, samples, ("mlp-5", "mlp-5-refu-approx"), library=Emulated())
