@@ -43,9 +43,10 @@ class ExportMesh:
 
 
 def meshes_of(
-    pipeline: GarmentPipeline, outputs: Sequence[PipelineOutput], *, with_body: bool = True
+    pipeline: GarmentPipeline, outputs: PipelineOutput | Sequence[PipelineOutput], *, with_body: bool = True
 ) -> list[ExportMesh]:
-    """The body and the garments in T pipeline outputs of one person, with the translation added."""
+    """The body and the garments in one or T pipeline outputs of one person, with the translation added."""
+    outputs = [outputs] if isinstance(outputs, PipelineOutput) else outputs
     found = []
     if with_body:
         bodies = np.stack([output.body + output.transl for output in outputs])

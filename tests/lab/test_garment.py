@@ -239,6 +239,13 @@ def test_a_glb_has_names_places_colours_and_textures(dressed: list[ExportMesh], 
     np.testing.assert_allclose(np.array(read.visual.material.baseColorFactor[:3]) / 255, kilt.color, atol=0.01)
 
 
+def test_one_output_is_exported_as_a_sequence_of_one() -> None:
+    pipeline = GarmentPipeline.load(["short-pant-male"])
+    output = pipeline(SmplFrame(pose=np.zeros((24, 3))))
+    for one, same in zip(meshes_of(pipeline, output), meshes_of(pipeline, [output]), strict=True):
+        np.testing.assert_array_equal(one.vertices, same.vertices)
+
+
 def test_an_obj_comes_back_as_it_was(dressed: list[ExportMesh], tmp_path: Path) -> None:
     kilt = replace(dressed[1], vertices=dressed[1].vertices[:1])
     (path,) = write_meshes([kilt], tmp_path / "kilt.obj")
