@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,25 +32,25 @@ _UPPER_SLICES = 4
 With them 2.0 % of 343 recorded colliders are cut near a skinned shirt, without them 2.6 %. 2 to 6 slices do the same;
 with 6, arms move aside in 25 % of the frames, with fewer in 16 %."""
 _THIN = 0.02
-"""What has a smaller radius, as fingers and thumbs have, makes no dent that cloth could follow [m]: the edges of a
-garment are about as long. So all of it has to be outside. Of 1,152 tops on other studios' motion, 15 weren't free of
-the body without this; 8 aren't."""
+"""A piece beside the palm with a smaller radius is a thumb [m]. It makes no dent that cloth could follow, whose edges
+are about as long, and goes out as far beyond the surface as it was inside, until it is wholly out. Of 1,152 tops on
+other studios' motion, 15 weren't free of the body without this; 8 aren't."""
 _TINY = 1e-18  # added to a square [m²]
 _FOREARMS = (joints_of("left_forearm"), joints_of("right_forearm"))
 _UPPER_ARMS = (joints_of("left_upper_arm"), joints_of("right_upper_arm"))
 
 
 class Aside:
-    """Swings arms about their shoulders until no middle of an arm or palm is inside the body, and no finger or thumb.
+    """Swings arms about their shoulders until no middle of an arm, palm, finger or thumb is inside the body.
 
     Flesh gives way to what dents it, but not to what is wholly inside: the two sides of a hand would move apart, and
     the skin around it has no reason to move at all. Cloth around a hip would have to go through the arm. A part whose
-    middle is outside is inside by half of its thickness at most, so it is a dent. Only a thumb would bore a hole
-    narrower than the cloth's triangles.
+    middle is outside is inside by half of its thickness at most, so it is a dent. Only a thumb bores a hole narrower
+    than the cloth's triangles, so it goes farther out.
 
-    Each middle that is inside, or too near for a finger, asks for the least turn that brings it out, and those with far
-    to go count most. So arms move continuously, and where nothing is inside, nothing moves. The exception is an arm
-    that is half-way through the trunk or a thigh: there the nearest way out changes sides, and the arm leaps.
+    Each middle that is inside asks for the least turn that brings it to the surface, and deep ones count most. So arms
+    move continuously, and where no middle is inside, nothing moves. The exception is an arm that is half-way through
+    the trunk or a thigh: there the nearest way out changes sides, and the arm leaps.
     """
 
     def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:
@@ -66,16 +66,17 @@ class Aside:
         # What is averaged: the skin around each shoulder, the pieces of the arms, and where they were cut off.
         rows = [np.clip(0.25 - np.abs(one - 0.5), 0.0, None) for one in share.T]
         arm: list[int] = []
-        found: list[Array] = []
+        thumbs: list[float] = []
         for i, (fore, upper) in enumerate(zip(_FOREARMS, _UPPER_ARMS, strict=True)):
             shoulder, elbow, hand = joints[upper[0]], joints[fore[0]], joints[fore[-1]]
             is_fore, is_upper = (weights[:, list(one)].sum(1) > 0.5 for one in (fore, upper))
             is_upper &= (rest - (shoulder + elbow) / 2) @ (elbow - shoulder) > 0
-            pieces = _pieces(rest, mesh, is_fore, hand - elbow, _SLICES)
-            pieces += _pieces(rest, mesh, is_upper, elbow - shoulder, _UPPER_SLICES)
-            found += pieces
+            is_hand = weights[:, list(fore[1:])].sum(1) > 0.5
+            pieces = _pieces(rest, mesh, is_fore, hand - elbow, _SLICES, is_hand)
+            pieces += _pieces(rest, mesh, is_upper, elbow - shoulder, _UPPER_SLICES, is_hand)
+            rows += [piece.vertices for piece in pieces]
+            thumbs += [piece.thumb for piece in pieces]
             arm += [i] * len(pieces)
-        rows += found
         self._first_cap = len(rows)
         for some in np.split(solids.middle_vertex, solids.middle_start[1:-1]):
             rows.append(np.bincount(some, minlength=len(rest)).astype(np.float64))
@@ -84,6 +85,8 @@ class Aside:
         self._start, self._vertex = self._tensor(np.searchsorted(row, np.arange(len(rows)))), self._tensor(vertex)
         self._weight = self._tensor(weight / np.bincount(row, weight)[row])
         self._arm = self._tensor(np.array(arm, np.int64))
+        self._thumb = self._tensor(np.array(thumbs, np.float32)[:, None])
+        """Radius of each middle's piece if it is of a thumb [m], else 0, shape (C, 1)."""
         self._is_of = self._arm == torch.arange(len(ARMS), device=device)[:, None]
         """Which of the C middles belong to each arm, shape (2, C)."""
         self._share = self._tensor(share.T[:, :, None])
@@ -98,12 +101,7 @@ class Aside:
         at_rest = body.v_template.to(self._points)
         self._points.copy_(torch.cat((at_rest, self._means(at_rest)[self._first_cap :])))
         self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), ints(solids.faces[0].ravel(), device))
-        middles = self._means(at_rest)[len(ARMS) : self._first_cap].cpu().numpy()
-        radius = [one @ np.linalg.norm(rest - at, axis=1) / one.sum() for one, at in zip(found, middles, strict=True)]
-        self._clear = self._tensor(np.where(np.array(radius) < _THIN, radius, 0.0).astype(np.float32))
-        """How far from the body each middle has to be [m], shape (C,)."""
-        fixed = [self._tree.id, *self._corners, as_warp(self._clear, wp.float32)]
-        self._find = Repeated(kernels.near_surface_kernel, (wp.vec3, wp.int32, wp.vec3, wp.float32), fixed)
+        self._find = Repeated(kernels.inside_kernel, (wp.vec3, wp.int32, wp.vec3), [self._tree.id, *self._corners])
         if self._is_serial:
             self._look = self._recorded_look(mesh, weights)
 
@@ -154,8 +152,8 @@ class Aside:
         places, self._n_near = memory(len(start) - 1, 3), memory(1, dtype=torch.int32)
         self._places = places[:n_middles]
         means.mean = as_warp(places, wp.vec3)
-        arguments = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means]
-        arguments += [as_warp(self._clear, wp.float32), *segments, *self._corners, as_warp(self._n_near, wp.int32)]
+        arguments = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means, *segments]
+        arguments += [*self._corners, as_warp(self._n_near, wp.int32)]
         return recorded(kernels.near_kernel, 1, arguments, "cpu")
 
     def _is_any_inside(self, skin: Tensor) -> bool:
@@ -168,35 +166,40 @@ class Aside:
         if not self._n_near:
             return False
         self._tree.refit()
-        return bool((self._closest(self._places)[0] >= 0).any())
+        return bool((self._inside(self._places)[0] >= 0).any())
 
-    def _closest(self, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The body's closest face to each middle at (C, 3) [m], -1 for one that is clear of it.
-
-        And the weights of its corners, and -1 for a middle inside, else 1.
-        """
+    def _inside(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """The body's closest face to each place (C, 3) [m], -1 for one outside, and the weights of its corners."""
         at = at.detach().float().contiguous()
         face, weights = torch.empty(len(at), dtype=torch.int32, device=self._device), torch.zeros_like(at)
-        side = torch.empty_like(at[:, 0])
-        self._find((len(at),), at, face, weights, side)
-        return face, weights, side
+        self._find((len(at),), at, face, weights)
+        return face, weights
 
     def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
-        """The way of each middle at (C, 3) [m] to where it is clear of the body; zeros for those that are."""
-        face, known, side = self._closest(at)
+        """The way out from each of the middles at (C, 3) [m] that is inside; zeros for the others."""
+        face, known = self._inside(at)
         corners = points[self._faces[face.clamp_min(0).long()]]
         weights = known if is_plain(points) else weights_at(at, corners, known.to(at))
-        away = side[:, None] * (at - (weights[..., None] * corners).sum(1))
-        distance = (away * away).sum(1, keepdim=True).clamp_min(_TINY).sqrt()
-        out = (self._clear[:, None] / distance - side[:, None]) * away
+        out = (weights[..., None] * corners).sum(1) - at
+        depth = (out * out).sum(1, keepdim=True).clamp_min(_TINY).sqrt()
+        out = out + (self._thumb / depth).clamp(max=1.0) * out
         return torch.where((face >= 0)[:, None], out, torch.zeros_like(out))
 
     def _tensor(self, values: NDArray[Any]) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), device=self._device)
 
 
-def _pieces(rest: Array, mesh: Connectivity, is_on: NDArray[np.bool_], along: Array, n_slices: int) -> list[Array]:
-    """The vertices of each connected piece of each slice of an arm's part, (V,): fingers are separate pieces."""
+class _Piece(NamedTuple):
+    vertices: Array
+    """1 for those that are in it, else 0, (V,)."""
+    thumb: float
+    """Radius of a piece of a thumb [m], else 0."""
+
+
+def _pieces(
+    rest: Array, mesh: Connectivity, is_on: NDArray[np.bool_], along: Array, n_slices: int, is_hand: NDArray[np.bool_]
+) -> list[_Piece]:
+    """Each connected piece of each slice of an arm's part: fingers are separate pieces, thumbs beside the palm."""
     (on,) = np.nonzero(is_on)
     height = rest[on] @ along
     slices = np.full(len(rest), -1)
@@ -204,7 +207,16 @@ def _pieces(rest: Array, mesh: Connectivity, is_on: NDArray[np.bool_], along: Ar
     of_ends = slices[mesh.edges]
     _, piece = linked(mesh.edges[(of_ends[:, 0] == of_ends[:, 1]) & (of_ends[:, 0] >= 0)], len(rest))
     names, sizes = np.unique(piece[on], return_counts=True)
-    return [(piece == name).astype(np.float64) for name in names[sizes >= _FEWEST]]
+    members = [np.flatnonzero(piece == name) for name in names[sizes >= _FEWEST]]
+    radius = [float(np.linalg.norm(rest[some] - rest[some].mean(0), axis=1).mean()) for some in members]
+    thick = {slices[some[0]] for some, r in zip(members, radius, strict=True) if r >= _THIN}
+    return [
+        _Piece(
+            np.bincount(some, minlength=len(rest)).astype(np.float64),
+            r if r < _THIN and slices[some[0]] in thick and is_hand[some].mean() > 0.5 else 0.0,
+        )
+        for some, r in zip(members, radius, strict=True)
+    ]
 
 
 def _within(turn: Tensor, most: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Finds which places are inside the body, or too near to it."""
+"""Finds which places are inside the body."""
 
 import warp as wp
 
@@ -14,7 +14,6 @@ def near_kernel(
     n_skin: int,
     n_middles: int,
     means: Means,
-    clear: wp.array[float],
     segment_start: wp.array[int],
     corner: wp.array[int],
     # outputs
@@ -22,9 +21,7 @@ def near_kernel(
     high_of_all: wp.array[wp.vec3],
     count: wp.array[int],
 ) -> None:
-    """Counts how often one of the first `n_middles` means is in, or within `clear` of, the box of a segment.
-
-    For a single thread of a CPU.
+    """Counts how often one of the first `n_middles` means is in the box of a segment; for a single thread of a CPU.
 
     The vertices of segment k's faces are `corner[segment_start[k]:segment_start[k + 1]]`. The other means close the
     body: they are appended to its skin.
@@ -47,42 +44,34 @@ def near_kernel(
         high_of_all[0] = greater(high_of_all[0], high)
         for c in range(n_middles):
             at = means.mean[c]
-            by = wp.vec3(clear[c])
-            if low == lesser(low, at + by) and high == greater(high, at - by):
+            if low == lesser(low, at) and high == greater(high, at):
                 near += 1
     count[0] = near
 
 
 @wp.kernel
-def near_surface_kernel(
+def inside_kernel(
     tree: wp.uint64,
     low: wp.array[wp.vec3],
     high: wp.array[wp.vec3],
-    clear: wp.array[float],
     points: wp.array[wp.vec3],
     # outputs
     face: wp.array[int],
     corners: wp.array[wp.vec3],
-    side: wp.array[float],
 ) -> None:
-    """Finds the mesh's closest face to each point inside of it or within `clear`, and the weights of its corners.
+    """Finds the mesh's closest face to each point inside of it, -1 for one outside, and the weights of its corners.
 
-    The face is -1 for other points. The side is -1 for points inside, and 1. `low` and `high` are the mesh's box.
+    `low` and `high` are the mesh's box.
     """
     i = wp.tid()
     p = points[i]
     face[i] = -1
-    side[i] = 1.0
     for c in range(3):
-        if p[c] < low[0][c] - clear[i] or p[c] > high[0][c] + clear[i]:
+        if p[c] < low[0][c] or p[c] > high[0][c]:
             return
     # A ray that points away from the middle of the box leaves it soonest, and meets few boxes of the tree.
-    ray = wp.vec3(wp.where(p[0] < 0.5 * (low[0][0] + high[0][0]), -0.9418, 0.9418), 0.2389, 0.2361)
-    reach = clear[i]
-    if wp.mesh_query_ray_count_intersections(tree, p, ray) % 2 == 1:
-        reach = 1.0e3
-        side[i] = -1.0
-    hit = wp.mesh_query_point_no_sign(tree, p, reach)
-    if hit.result:
+    side = wp.vec3(wp.where(p[0] < 0.5 * (low[0][0] + high[0][0]), -0.9418, 0.9418), 0.2389, 0.2361)
+    if wp.mesh_query_ray_count_intersections(tree, p, side) % 2 == 1:
+        hit = wp.mesh_query_point_no_sign(tree, p, 1.0e3)
         face[i] = hit.face
         corners[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)

@@ -20,7 +20,6 @@ from refu_core.body._creases import _parting
 from refu_core.errors import MeshError
 from refu_core.metrics import SelfContactDetector
 from refu_core.realtime import Outfit
-from refu_core.sdf import Winding
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -207,24 +206,21 @@ def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Coll
     assert collider.shift(skin.vertices, aside, aside)[0, 3] == 0
 
 
-@pytest.mark.parametrize("turns", [*INSIDE.values(), {"left_shoulder": (0, 0, -1.5)}], ids=[*INSIDE, "fingertips"])
-def test_fingers_and_thumbs_are_wholly_outside(
-    turns: dict[str, tuple[float, float, float]], body: SmplBody, collider: Collider
-) -> None:
-    """Cloth can't follow a dent as narrow as a finger."""
+def test_a_thumb_goes_out_as_far_as_it_was_inside(body: SmplBody, collider: Collider) -> None:
+    """Cloth can't follow a dent as narrow as a thumb. Nothing is asked where no middle is inside: it is continuous."""
+    skin = body(pose=posed(body, INSIDE["hand in the hip"])).vertices[0]
     aside = collider.anatomy.aside
-    start = torch.cat((aside._start, torch.tensor([len(aside._vertex)]))).tolist()
-    thin = [len(ARMS) + i for i in torch.nonzero(aside._clear).ravel().tolist()]
-    fingers = torch.cat([aside._vertex[start[i] : start[i + 1]] for i in thin])
-    assert (body.weights[fingers][:, [18, 19, 20, 21, 22, 23]].sum(1) > 0.5).all()
-    skin = body(pose=posed(body, turns))
-    went, _ = collider.aside(skin.vertices, skin.transforms.rotation)
-    winding, n_inside = Winding(aside._faces), []
-    for one in (skin.vertices[0], went[0]):
-        winding.update(torch.cat((one, aside._means(one)[aside._first_cap :])))
-        n_inside.append(int(torch.count_nonzero(winding(one[fingers]))))
-    assert n_inside[0] > 20
-    assert n_inside[1] <= 2
+    points, middles = _asked(collider, skin)
+    way, thumb = aside._way_out(points, middles), aside._thumb[:, 0].clone()
+    assert 2 <= torch.count_nonzero(thumb) <= 8
+    assert thumb.max() < 0.02
+    aside._thumb.zero_()
+    try:
+        depth = aside._way_out(points, middles).norm(dim=1)
+    finally:
+        aside._thumb.copy_(thumb[:, None])
+    torch.testing.assert_close(way.norm(dim=1), depth + torch.minimum(depth, thumb), atol=1e-6, rtol=1e-5)
+    assert (depth[thumb > 0] > 0).any()
 
 
 def test_an_arm_that_is_too_deep_is_held(body: SmplBody, collider: Collider) -> None:
