@@ -85,13 +85,14 @@ class Parting:
         return self._points.clone()
 
     def parted(self, above: Tensor, distance: Tensor) -> Tensor:
-        """The outer garment, (V, 3) [m], moved off the sheet if that leaves half the cuts at most, or the very same.
+        """The outer garment, (V, 3) [m], moved off the sheet if that leaves half the cuts; else as it was.
+
+        A CPU then returns the very same tensor.
 
         `distance` (V,) is how far from the sheet its vertices are at least [m]. An approximate one may be too long and
         hide cuts. So it only says where to look for a first one; if there is one, all are looked for. Where a hand is
-        deep in a hip, the way out of one leads into the other, and nothing is done. Of recorded motion no cut is left;
-        with limbs through the trunk there are 0.5 to 2 times as many, mostly about as many, and were fewer enough,
-        rounding would decide.
+        deep in a hip, the way out of one leads into the other, and nothing is done. On recorded motion no cut is left.
+        With limbs through the trunk about as many are left, so rounding would decide if one cut fewer were enough.
         """
         n_seen = self.find(above, distance)
         if self._is_serial and not int(n_seen):

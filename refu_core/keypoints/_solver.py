@@ -92,7 +92,7 @@ _MIRROR = np.array([1.0, -1, -1])
 
 
 def resting() -> tuple[Array, Array]:
-    """Mean (24, 3) [rad] and precision (24, 3, 3) of each joint's rotation vector; that of the root is unknown."""
+    """Mean (24, 3) [rad] and precision (24, 3, 3) of each joint's rotation vector; zeros for the root."""
     mean, precision = np.zeros((N_JOINTS, 3)), np.zeros((N_JOINTS, 3, 3))
     for i, name in enumerate(JOINT_NAMES[1:], start=1):
         side, _, part = name.rpartition("_")
