@@ -87,7 +87,7 @@ class Parting:
     def parted(self, above: Tensor, distance: Tensor) -> Tensor:
         """The outer garment, (V, 3) [m], moved off the sheet if that leaves half the cuts; else as it was.
 
-        A CPU then returns the very same tensor.
+        Where nothing cuts, a CPU returns the very same tensor.
 
         `distance` (V,) is how far from the sheet its vertices are at least [m]. An approximate one may be too long and
         hide cuts. So it only says where to look for a first one; if there is one, all are looked for. Where a hand is
