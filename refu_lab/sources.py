@@ -126,7 +126,7 @@ def open_source(options: RecordingOptions, pipeline: GarmentPipeline | None = No
         read = description, INPUT_TOPIC, kind, decode, _motion_records(motion), len(motion)
         said: dict[str, Any] = {"notes": motion.notes, "gender": motion.gender, "is_fitted": motion.is_fitted}
         return Source(options, load(), *read, **said)
-    if options.fps is not None or options.input_axes in ("z-up", "y-down", "z-down"):
+    if options.fps is not None or options.input_axes not in ("auto", "smpl", "frame"):
         what = "--fps" if options.fps is not None else f"--input-axes {options.input_axes}"
         msg = f"{options.input}: {what} is for files of motion ({', '.join(SUFFIXES)})"
         msg += "" if options.fps is not None else "; the axes of bags are smpl or frame"

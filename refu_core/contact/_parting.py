@@ -85,7 +85,7 @@ class Parting:
         return self._points.clone()
 
     def parted(self, above: Tensor, distance: Tensor) -> Tensor:
-        """The outer garment, (V, 3) [m], moved off the sheet if that leaves half the cuts; else as it was.
+        """The outer garment, (V, 3) [m], moved off the sheet if at most half the cuts are left; else as it was.
 
         Where nothing cuts, a CPU returns the very same tensor.
 

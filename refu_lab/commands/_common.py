@@ -18,6 +18,7 @@ from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.modes import BetasSource
 from refu_core.options import Spec, setting, specs_of
+from refu_core.recordings import AXES
 from refu_lab.tables import write_json
 
 Number = TypeVar("Number", int, float)
@@ -216,7 +217,7 @@ def axes_of(what: str, frame: str) -> Any:
         "auto",
         f"axes of the {what} root: inferred from the people, and reported (auto); y up (smpl); z-up (AMASS); y-down (a "
         f"camera); z-down (Motion-X); or {frame} (frame)",
-        choices=("auto", "smpl", "z-up", "y-down", "z-down", "frame"),
+        choices=AXES,
     )
 
 
