@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from refu_core.body import SmplBody, load_body
 from refu_core.frames import N_BETAS
 from refu_core.garments import BUILTIN_GARMENTS, N_STYLES, GarmentTemplate, load_garment
+from refu_core.garments._file import shortened
 from refu_core.mesh import vertex_areas, vertex_normals
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothTopology
@@ -223,7 +224,7 @@ def main() -> int:
             arrays = {key: data[key] for key in data.files}
         arrays |= build_styles(garment, load_body(garment.body))
         args.output.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(args.output / f"garment_{name}.npz", **arrays)
+        np.savez_compressed(args.output / f"garment_{name}.npz", **shortened(arrays))
         print(name, np.round(arrays["tailoring_from_style"].T, 2), [one.name for one in garment.card.tailoring])
     return 0
 

@@ -20,6 +20,7 @@ from refu_core.errors import WeightsError
 from refu_core.frames import N_STYLES
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity, symmetric_solver
+from refu_core.weights import in_steps
 
 _HOLD = 100.0
 """How much more a control's own value weighs than the smoothness at a vertex."""
@@ -84,7 +85,6 @@ _A_FEW = 16
 _WHOLE = 32
 """Components in half precision; the others are bytes, which moves a garment by 0.06 mm on recorded motion, 0.5 mm at
 most. With 16 it is 0.11 and 0.8 mm; with 64 it is 0.03 and 0.3 mm, but a garment's basis takes a third more."""
-_STEPS = 127
 
 
 class DenseDecoder(nn.Module):
@@ -222,11 +222,8 @@ class _Stored(NamedTuple):
     def of(cls, components: Tensor) -> _Stored:
         """From components (R, 3 V). For components that were stored before, it gives what was stored, to the bit."""
         rest = components[_WHOLE:]
-        largest = rest.abs().amax(1) if len(rest) else rest.new_zeros(0)
-        # 127 steps have few enough digits for float32, so the largest component tells what the step was.
-        steps = (largest / _STEPS).bfloat16().float()
-        fine = (rest / steps.clamp_min(torch.finfo().tiny)[:, None]).round().clamp(-_STEPS, _STEPS)
-        return cls(components[:_WHOLE].half().float(), fine.to(torch.int8), steps)
+        fine, steps = in_steps(rest, 1) if len(rest) else (rest.to(torch.int8), rest[:, :1])
+        return cls(components[:_WHOLE].half().float(), fine, steps[:, 0])
 
     def components(self) -> Tensor:
         """Components as numbers, float32, shape (R, 3 V). Raises `WeightsError` for parts that don't fit each other."""

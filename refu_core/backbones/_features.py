@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from refu_core.body import rotvec_to_rotmat
+from refu_core.body import rotvec_to_rotmat, up_in
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_STYLES
 from refu_core.garments import GarmentTemplate
@@ -26,7 +26,7 @@ def up_in_root(pose: Tensor) -> Tensor:
 
     This is all of the root's rotation that matters to cloth: it tilts gravity, and the heading changes nothing.
     """
-    return rotvec_to_rotmat(pose[:, 0])[:, 1]
+    return up_in(rotvec_to_rotmat(pose[:, 0]))
 
 
 SEEN_TILT = (np.radians(40), np.radians(60))
@@ -127,7 +127,7 @@ class PoseFeatures(nn.Module):
             whole = torch.cat((tilt_rotvec(told_up(up_in_root(pose)))[:, None], pose[:, 1:]), 1)
             return (whole * self._keep).flatten(1)
         rotations = rotvec_to_rotmat(pose[:, self._index])  # the root's first
-        return torch.cat((told_up(rotations[:, 0, 1]), (rotations[:, 1:] - self._eye).flatten(1)), 1)
+        return torch.cat((told_up(up_in(rotations[:, 0])), (rotations[:, 1:] - self._eye).flatten(1)), 1)
 
 
 def style_shape(betas: Tensor, style: Tensor | None) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,7 @@ def _read(path: Path, device: str | torch.device, dtype: torch.dtype) -> Garment
 def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Path:
     """Writes a garment's file, which `load_garment` reads; it is never left half written.
 
-    Lengths are kept to a micrometre and shares to a hundred-thousandth, which halves the file.
+    Lengths are kept to a micrometre, which halves the file.
 
     Returns the file's path. Raises `GarmentError` for anything that isn't a template, a card that is too long, and a
     path that doesn't end in `.npz`, gives no valid name or can't be written.
@@ -140,23 +141,22 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         msg = f"{target}: wanted a card of at most {MAX_TEXT_BYTES} bytes, got {len(card)}: say less of its provenance"
         raise GarmentError(msg)
     n = template.n_vertices
-    weights = _rounded(template.weights, 16)
     arrays: dict[str, Any] = {
-        "v_template": _rounded(template.v_template, 20),
+        "v_template": template.v_template.cpu().double().numpy(),
         "f": template.faces.cpu().numpy().astype(np.uint32),
-        "weights": (weights / weights.sum(1, keepdims=True)).astype(np.float32),
-        "shapedirs": _rounded(template.shapedirs, 20).reshape(n, 3, N_BETAS),
+        "weights": template.weights.cpu().double().numpy(),
+        "shapedirs": template.shapedirs.cpu().double().numpy().reshape(n, 3, N_BETAS),
         "body": np.array(template.body),
         "card": np.array(card),
     }
     if template.styledirs is not None:
-        arrays["styledirs"] = _rounded(template.styledirs, 20).reshape(n, 3, N_STYLES)
+        arrays["styledirs"] = template.styledirs.cpu().double().numpy().reshape(n, 3, N_STYLES)
     if template.uv is not None:
         arrays |= {"uv": template.uv.coordinates, "uv_f": template.uv.faces.astype(np.uint32)}
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with replacing(target) as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **shortened(arrays))
     except OSError as error:
         raise GarmentError(f"{target}: can't be written: {error.strerror}") from error
     return target
@@ -167,10 +167,27 @@ def _name_in(path: Path) -> str:
     return path.stem.removeprefix("garment_")
 
 
-def _rounded(tensor: torch.Tensor, bits: int) -> NDArray[np.float32]:
-    """Rounds to multiples of 2^-bits: the insignificant bits become zeros, which compress to nothing."""
+def shortened(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """A garment file's arrays, rounded to multiples of powers of two: zeros at the end compress to nothing.
+
+    Lengths are kept to a micrometre and shares to a hundred-thousandth.
+    """
+    short = dict(arrays)
+    for name in _LENGTHS & short.keys():
+        short[name] = _rounded(short[name], 20).astype(np.float32)
+    weights = _rounded(short["weights"], 16)
+    short["weights"] = (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+    return short
+
+
+_LENGTHS = {"v_template", "shapedirs", "styledirs"}
+
+
+def _rounded(values: NDArray[Any], bits: int) -> NDArray[np.float64]:
+    """Multiples of 2^-bits."""
     scale = float(1 << bits)
-    return (np.rint(tensor.cpu().double().numpy() * scale) / scale).astype(np.float32)
+    rounded: NDArray[np.float64] = np.rint(values.astype(np.float64) * scale) / scale
+    return rounded
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:

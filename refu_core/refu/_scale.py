@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from refu_core.body import rotvec_to_rotmat
+from refu_core.body import rotvec_to_rotmat, up_in
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 
 ScaleKind = Literal["vertex", "shared", "distance"]
@@ -146,7 +146,7 @@ def scale_inputs(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
     angle = torch.linalg.vector_norm(pose, dim=-1, keepdim=True)
     wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
     joints = pose * (wrapped / angle.clamp_min(1e-6))
-    up = rotvec_to_rotmat(joints[:, 0])[:, 1]
+    up = up_in(rotvec_to_rotmat(joints[:, 0]))
     gamma = betas.new_zeros(len(betas), 4) if style is None else style
     return torch.cat((betas, joints[:, 1:].flatten(1), up, gamma), dim=1)
 

@@ -152,7 +152,7 @@ def finetune(
     card["knows_limbs"] = opened.knows_limbs
     if is_writer():
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")
-        nets.save_backbone(stem, network, card, others=others, half=preset != "paper")
+        nets.save_backbone(stem, network, card, others=others, exact=preset == "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 

@@ -169,7 +169,7 @@ def pretrain(
     if is_writer():
         refu = None if stored is None else refu_from_weights(stored)
         layer = None if refu is None else refu_tensors(refu, half=preset != "paper")
-        nets.save_backbone(stem, model, card, others=layer, half=preset != "paper")
+        nets.save_backbone(stem, model, card, others=layer, exact=preset == "paper")
         loop.checkpoint.unlink(missing_ok=True)
     return card
 

@@ -9,3 +9,4 @@ from refu_core.weights._files import load_card as load_card
 from refu_core.weights._files import load_weights as load_weights
 from refu_core.weights._files import save_weights as save_weights
 from refu_core.weights._files import weights_folder as weights_folder
+from refu_core.weights._steps import in_steps as in_steps

@@ -1,8 +1,8 @@
 """Reads and writes weights; files are checked before their content is used.
 
-Weights may be stored as differences from others in the same folder, their base. A difference is a whole number of
-steps, -127 to 127, in one byte: differences a tenth as large as the weights are as exact in 8 bits as the weights are
-in half precision. A tensor that isn't stored at all is the base's.
+A tensor may be stored as whole numbers of steps, -127 to 127, a byte each. Weights may be stored as differences from
+others in the same folder, their base: differences a tenth as large as the weights are as exact in bytes as the weights
+are in half precision. A tensor that isn't stored at all is the base's.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
@@ -26,6 +26,7 @@ from refu_core._files import InputFile, open_file, parse_json, replacing
 from refu_core._npz import DAMAGE
 from refu_core._versions import versions
 from refu_core.errors import WeightsError, require_type
+from refu_core.weights._steps import in_steps
 
 FORMAT = "refu-weights-1"
 MAX_BYTES = 3 << 30
@@ -39,8 +40,7 @@ _DTYPES = {
 }
 _PIECE = 1 << 22
 _STEP = ".step"
-"""Follows a tensor's name in the name of another one: the size of one step of its difference, a number."""
-_STEPS = 127
+"""Follows the name of a tensor in bytes in the name of another one: the size of a step, or of those of its rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,17 +66,28 @@ def weights_folder(garment: str, root: str | os.PathLike[str] | None = None) -> 
 
 
 def save_weights(
-    stem: str | Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any], *, base: str | None = None
+    stem: str | Path,
+    tensors: Mapping[str, Tensor],
+    card: Mapping[str, Any],
+    *,
+    in_bytes: Collection[str] = (),
+    base: str | None = None,
 ) -> Path:
     """Writes `stem`.safetensors, which is returned, and its card `stem`.json; neither is ever left half written.
 
-    `base` is the name of weights in the same folder, stored whole, that these are stored as differences from. Tensors
-    that only the base has are read as the base's. Raises `WeightsError` where a tensor isn't finite, the base can't be
-    read, or the disk can't be written.
+    Tensors named in `in_bytes` are stored as whole numbers of steps, with a step for each row along dimension 1. `base`
+    is the name of weights in the same folder, stored whole, that these are stored as differences from. Tensors that
+    only the base has are read as the base's. Raises `WeightsError` where a tensor isn't finite, the base can't be read,
+    or the disk can't be written.
     """
     stem = Path(stem)
     _require_sense(stem, tensors)
     differs: dict[str, Any] = {}
+    if in_bytes:
+        stored = {name: tensor for name, tensor in tensors.items() if name not in in_bytes}
+        for name in in_bytes:
+            stored[name], stored[name + _STEP] = in_steps(tensors[name].detach().cpu().float(), 1)
+        tensors = stored
     if base is not None:
         loaded = load_weights(stem.with_name(base))
         if "base" in loaded.card:
@@ -113,9 +124,7 @@ def load_weights(stem: str | Path, *, expect: Mapping[str, Any] | None = None) -
     base = _load_stored(Path(stem).with_name(name))
     if "base" in base.card or base.card["sha256"] != stored.card.get("base_sha256"):
         raise WeightsError(f"{stored.path}: made for another {name} than the one beside it; get both files again")
-    tensors = _sum(base, stored)
-    _require_sense(stored.path, tensors)
-    return replace(stored, tensors=tensors, files=(*base.files, *stored.files))
+    return replace(_whole(stored, base.tensors), files=(*base.files, *stored.files))
 
 
 def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weights:
@@ -126,9 +135,8 @@ def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weig
             msg = f"{path}: wanted weights whose {key} is {wanted}, got {card.get(key)}; train some with `refu train`, "
             msg += "into a folder of their own (--output)"
             raise WeightsError(msg)
-    tensors = _read_tensors(path, card.get("sha256"))
-    _require_sense(path, tensors)
-    return Weights(tensors, card, path, (path,))
+    stored = Weights(_read_tensors(path, card.get("sha256")), card, path, (path,))
+    return stored if "base" in card else _whole(stored, {})
 
 
 def _require_sense(path: Path, tensors: Mapping[str, Tensor]) -> None:
@@ -149,25 +157,27 @@ def _differences(tensors: Mapping[str, Tensor], base: Mapping[str, Tensor]) -> d
             stored[name] = tensor
             continue
         difference = tensor.detach().cpu().float() - base[name].float()
-        step = difference.abs().max() / _STEPS
-        if step > 0:
-            stored[name], stored[name + _STEP] = (difference / step).round().to(torch.int8), step
+        if bool(difference.any()):
+            stored[name], stored[name + _STEP] = in_steps(difference)
     return stored
 
 
-def _sum(base: Weights, stored: Weights) -> dict[str, Tensor]:
-    """The inverse of `_differences`."""
-    tensors = {**base.tensors, **{k: v for k, v in stored.tensors.items() if not k.endswith(_STEP)}}
+def _whole(stored: Weights, base: Mapping[str, Tensor]) -> Weights:
+    """What is `stored` with numbers in place of bytes, and with the tensors of its base."""
+    tensors = {**base, **{k: v for k, v in stored.tensors.items() if not k.endswith(_STEP)}}
     for name, step in stored.tensors.items():
         if not name.endswith(_STEP):
             continue
         name = name.removesuffix(_STEP)
-        whole, steps = base.tensors.get(name), stored.tensors.get(name)
-        if whole is None or steps is None or (steps.dtype, steps.shape, step.ndim) != (torch.int8, whole.shape, 0):
-            msg = f"{stored.path}: {name[:80]} isn't a difference from a tensor of {base.path.name}; get them again"
-            raise WeightsError(msg)
-        tensors[name] = whole.float() + step * steps
-    return tensors
+        steps, start = stored.tensors.get(name, step), base.get(name)
+        is_known = start is None if "base" not in stored.card else start is not None and start.shape == steps.shape
+        fits = steps.dtype == torch.int8 and step.shape in ((), (*steps.shape[:1], 1, *steps.shape[2:]))
+        if not (is_known and fits):
+            wanted = f"a difference from a tensor of {stored.card['base']}.safetensors" if base else "a number of steps"
+            raise WeightsError(f"{stored.path}: {name[:80]} isn't {wanted}; get them again")
+        tensors[name] = step * steps if start is None else start.float() + step * steps
+    _require_sense(stored.path, tensors)
+    return replace(stored, tensors=tensors)
 
 
 def _read_tensors(path: Path, sha256: Any) -> dict[str, Tensor]:

@@ -25,6 +25,7 @@ from refu_core.body import (
     SmplBody,
     part_of_faces,
     rotvec_to_rotmat,
+    up_in,
     weight_of_parts,
 )
 from refu_core.body._model import BodyArrays
@@ -159,6 +160,17 @@ def test_rotation_matrices(length: float, seed: int) -> None:
     single = rotvec_to_rotmat(torch.as_tensor(rotvec, dtype=torch.float32)).numpy()
     np.testing.assert_allclose(single, wanted, atol=4e-7 * max(1, length))
     np.testing.assert_allclose(single @ single.T, np.eye(3), atol=2e-6)
+
+
+def test_up_does_not_tell_the_heading_and_has_derivatives() -> None:
+    rng = np.random.default_rng(0)
+    tilt = Rotation.from_rotvec(rng.uniform(-1, 1, (300, 3)))
+    turned = Rotation.from_euler("y", rng.uniform(-np.pi, np.pi, (300, 1))) * tilt
+    ups = [up_in(rotvec_to_rotmat(torch.tensor(r.as_rotvec(), dtype=torch.float32))) for r in (tilt, turned)]
+    assert (ups[0] == ups[1]).all(1).sum() >= 297  # on the border between two places of the grid rounding decides
+    assert (ups[0] - torch.tensor(tilt.as_matrix()[:, 1], dtype=torch.float32)).abs().max() < 2**-15 + 1e-6
+    rotvec = torch.tensor(tilt.as_rotvec()[:4], requires_grad=True)
+    assert torch.autograd.gradcheck(lambda r: up_in(rotvec_to_rotmat(r)), rotvec)
 
 
 @pytest.mark.parametrize(

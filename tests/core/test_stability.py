@@ -96,8 +96,8 @@ def test_the_largest_numbers_that_are_not_refused_end_in_finite_time(seed: int) 
 def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(subject: Subject) -> None:
     """In world axes a turn made 11 cm of difference to a vertex of the mode hybrid, and 3 mm to one of accurate.
 
-    With a network the rounding of gravity's direction is left, which may decide anew which way out of a limb is the
-    closest. Of 24 such frames 3 differ by more than the margin, one by 5 mm.
+    When networks were told of gravity's direction to the last bit, how it had been rounded decided anew which way out
+    of a limb is the closest: of 24 such frames 11 differed by more than the margin, by up to 5 mm.
     """
     check = CHECKS["invariance: the person turned"]
     limits, deviations = [], []
@@ -106,11 +106,7 @@ def test_turned_persons_wear_the_same_where_limbs_run_into_each_other(subject: S
         measured = check.run(subject, Trial((frame,), seed))
         limits.append(measured.limit)
         deviations.append(measured.deviation)
-    if subject.wardrobe.backbone == "skinned":
-        assert np.all(np.less(deviations, limits)), deviations
-    else:
-        assert np.median(deviations) < 1e-3, deviations
-        assert max(deviations) < 0.025, deviations
+    assert np.all(np.less(deviations, limits)), deviations
 
 
 @pytest.mark.parametrize("path", WORST, ids=[path.stem for path in WORST])

@@ -184,6 +184,45 @@ def test_what_is_no_difference_is_refused(
         load_weights(tmp_path / "other")
 
 
+@pytest.mark.parametrize("shape", [(40, 30), (3, 40, 30)])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 50.0])
+def test_bytes_are_off_by_half_a_step_and_stay_the_same(tmp_path: Path, shape: tuple[int, ...], scale: float) -> None:
+    w = scale * torch.randn(shape, generator=torch.Generator().manual_seed(2))
+    w[0, 0] = 0
+    path = save_weights(tmp_path / "first", {"w": w, "b": torch.ones(3)}, CARD, in_bytes=["w"])
+    read = load_weights(tmp_path / "first")
+    assert read.tensors.keys() == {"w", "b"}
+    assert ((read.tensors["w"] - w).abs() <= w.abs().amax(1, keepdim=True) / 127 * 0.51).all()
+    again = save_weights(tmp_path / "second", read.tensors, CARD, in_bytes=["w"])
+    assert path.read_bytes() == again.read_bytes()
+    save_weights(tmp_path / "other", {"w": w + 0.01 * scale}, CARD, base="first")
+    torch.testing.assert_close(
+        load_weights(tmp_path / "other").tensors["w"], w + 0.01 * scale, rtol=0, atol=1e-3 * scale
+    )
+
+
+@pytest.mark.parametrize(
+    "tensors",
+    [
+        {"w.step": torch.ones(())},
+        {"w": torch.ones(4, 3), "w.step": torch.ones(())},
+        {"w": torch.ones(4, 3, dtype=torch.int8), "w.step": torch.ones(4)},
+        {"w": torch.ones(4, 3, dtype=torch.int8), "w.step": torch.ones(3, 1)},
+        {"w": torch.ones(4, 3, dtype=torch.int8), "w.step": torch.ones(4, 3)},
+    ],
+)
+def test_what_is_no_number_of_steps_is_refused(tmp_path: Path, tensors: dict[str, torch.Tensor]) -> None:
+    save_weights(tmp_path / "w", tensors, CARD)
+    with pytest.raises(WeightsError, match=r"w isn't a number of steps; get them again"):
+        load_weights(tmp_path / "w")
+
+
+def test_steps_cannot_hide_what_is_too_large(tmp_path: Path) -> None:
+    save_weights(tmp_path / "w", {"w": torch.full((2, 2), 127, dtype=torch.int8), "w.step": torch.tensor(100.0)}, CARD)
+    with pytest.raises(WeightsError, match=r"wanted weights of at most 10000, got larger ones in w"):
+        load_weights(tmp_path / "w")
+
+
 @pytest.mark.parametrize("garment", PAPER_GARMENTS)
 def test_what_ships_shares_the_defaults_backbone_where_it_can(garment: str) -> None:
     """Fine-tuning brings a garment's networks to the same backbone by either distance."""
