@@ -87,17 +87,6 @@ class Connectivity:
         """The faces around each vertex."""
         return _grouped(self.faces.ravel(), np.repeat(np.arange(len(self.faces)), 3), self.n_vertices)
 
-    @cached_property
-    def independent(self) -> NDArray[np.bool_]:
-        """A maximal independent set, shape (V,): no edge joins two of its vertices, and every other is next to one."""
-        is_free, chosen = np.ones(self.n_vertices, np.bool_), np.zeros(self.n_vertices, np.bool_)
-        start, items = self.ring
-        for vertex in range(self.n_vertices):
-            if is_free[vertex]:
-                chosen[vertex] = True
-                is_free[items[start[vertex] : start[vertex + 1]]] = False
-        return chosen
-
     def require_closed(self) -> None:
         """Raises `MeshError` where the mesh isn't a closed, consistently oriented surface."""
         start, end = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()

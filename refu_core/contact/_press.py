@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core._warp import as_warp, ints, memory, recorded, refit, torch_stream
@@ -31,8 +30,6 @@ class LimbMeshes:
         self._device = str(body.device)
         self._vertices = memory(*body.v_template.shape, device=body.device).copy_(body.v_template)
         self._is_late = np.zeros(len(_LIMBS), np.bool_)
-        self.rest = body.v_template.cpu().numpy()
-        """The body's vertices in the rest pose [m], shape (V, 3)."""
         points = as_warp(self._vertices, wp.vec3)
         limb_of = part_of_faces(body.weights, body.faces, _LIMBS).cpu().numpy()
         faces = body.faces.cpu().numpy()
@@ -66,9 +63,6 @@ class Press:
     Where another limb comes between a vertex and its skin, the vertex is drawn back to the skin's side of it, and its
     neighbours with it. All of this is continuous: the nearer a limb is to the line from skin to vertex, the farther
     back the vertex goes.
-
-    It is called twice: for cloth as predicted, and for cloth that was pushed off the body. A limb may push a vertex to
-    its far side, and the skin may push it into a limb.
     """
 
     def __init__(
@@ -89,18 +83,13 @@ class Press:
         self._counts = memory(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
         own = weight_of_parts(garment.weights, _LIMBS) > 0
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
-        # Cloth that lies on the skin gives way as one piece: only some of its vertices are tested, and others follow.
-        rest = garment.v_template.cpu().numpy()
-        is_loose = cKDTree(limbs.rest).query(rest)[0] > settings.limb_reach
-        is_asked = is_loose | garment.mesh.independent
-        order, ring = grouped_at_rest(rest), garment.mesh.ring
-        order = order[is_asked[order]]
+        order, ring = grouped_at_rest(garment.v_template.cpu().numpy()), garment.mesh.ring
         fabric = kernels.Fabric()
         fabric.skin, fabric.points = as_warp(self._skin, wp.vec3), as_warp(self._points, wp.vec3)
         fabric.cut, fabric.spread = (as_warp(one, wp.float32) for one in self._cut)
         fabric.counts = as_warp(self._counts, wp.int32)
         lists = {
-            "start": [*range(0, len(order), _PIECE if self._is_serial else 1), len(order)],
+            "start": [*range(0, n, _PIECE if self._is_serial else 1), n],
             "vertex": order,
             "foreign": foreign,
             "ring_start": ring.start,
@@ -110,21 +99,14 @@ class Press:
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
         self._meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
-        self._commands = {
-            False: self._launches(
-                fabric, garment.edge_length if knows_arms else settings.limb_reach, settings.gap, 0.0
-            ),
-            True: self._launches(fabric, settings.gap, settings.gap / 2, settings.tolerance),
-        }
+        beside = garment.edge_length if knows_arms else settings.limb_reach / 2
+        self._commands = self._launches(fabric, beside)
 
-    def _launches(self, fabric: Any, beside: float, room: float, slack: float) -> dict[str, Any]:
-        """The recorded steps, by name: cloth feels limbs up to `beside` [m] to its side, and stays `room` [m] off.
-
-        What has to be drawn back by less than the `slack` [m] stays.
-        """
+    def _launches(self, fabric: Any, beside: float) -> dict[str, Any]:
+        """The recorded steps, by name: cloth feels limbs up to `beside` [m] to its side."""
         settings, meshes, n = self._settings, self._meshes, len(self._points)
         feel = kernels.Feel()
-        feel.room, feel.lies, feel.beside, feel.slack = room, settings.limb_reach, beside, slack
+        feel.room, feel.lies, feel.beside = settings.gap, settings.limb_reach, beside
         sweeps, near = settings.around, settings.near
         launches: dict[str, tuple[Any, int, list[Any]]] = {
             "look": (kernels.look_kernel, len(fabric.start) - 1, [fabric, self._limbs.bundles, feel]),
@@ -138,32 +120,30 @@ class Press:
         return {name: recorded(*launch, self.device) for name, launch in launches.items()}
 
     @torch.no_grad()
-    def __call__(self, points: Tensor, skin: Tensor, *, was_pushed: bool = False) -> Tensor:
+    def __call__(self, points: Tensor, skin: Tensor) -> Tensor:
         """The garment (N, 3) [m], pressed by the limbs to the `skin` (N, 3) [m] that it lies on.
 
-        Once it `was_pushed` off the body, only limbs that are right between count, within `gap`. Where none is, a
-        CPU returns the very same points.
+        Where no limb comes between, a CPU returns the very same points.
         """
-        commands = self._commands[was_pushed]
         self._points.copy_(points)
         self._skin.copy_(skin)
         self._counts.zero_()
         with torch_stream(self.device):
-            commands["look"].launch()
+            self._commands["look"].launch()
             wanted = int(self._counts[kernels.WANTED]) if self._is_serial else -1
             if not wanted:
                 return points
             self._limbs.pose(wanted)
             if self._is_serial:
-                commands["press all"].launch()
+                self._commands["press all"].launch()
                 if not self._counts[kernels.PRESSED]:
                     return points
             else:
                 self._cut.zero_()
-                commands["press"].launch()
+                self._commands["press"].launch()
                 for sweep in range(self._settings.around):
-                    commands[f"spread {sweep}"].launch()
-                commands["lower"].launch()
+                    self._commands[f"spread {sweep}"].launch()
+                self._commands["lower"].launch()
         pressed: Tensor = self._points.clone()
         return pressed
 

@@ -17,7 +17,6 @@ class Feel:
     """The `ContactSettings` that the kernels read."""
 
     room: wp.float32
-    slack: wp.float32
     beside: wp.float32
     lies: wp.float32
 
@@ -125,7 +124,7 @@ def press(v: int, fabric: Fabric, limbs: wp.array[wp.uint64], feel: Feel) -> Non
         # Cloth at the skin has nothing to give, and cloth far off doesn't lie on this skin.
         lies = wp.clamp(2.0 - height / feel.lies, 0.0, 1.0)
         lies *= wp.clamp(height / feel.room - 1.0, 0.0, 1.0)
-        cut = lies * (height - wp.max(least - feel.room, 0.5 * least)) - feel.slack
+        cut = lies * (height - wp.max(least - feel.room, 0.5 * least))
         if cut > 0.0:
             fabric.cut[v] = cut
             fabric.rows[wp.atomic_add(fabric.counts, PRESSED, 1)] = v

@@ -42,13 +42,13 @@ class ContactSettings:
     leave 2.3 % of frames cut, 32 and 48 leave 0.3 %, and 100 none. With 48 a T-shirt jumps by more than 20 mm in 1.7 %
     of frame pairs (with its network alone in 1.2), with 100 in 2.9 %."""
     limb_reach: float = 0.08
-    """How far to the side of a limb cloth still feels it, less and less [m]: a swinging hand moves 30 mm in a frame.
-    Cloth near its skin feels limbs from less far: twice its height squared, divided by this. Up to this height cloth
-    lies on its skin; at twice the height it doesn't, since neighbours there lie on different legs, and would tear if
-    pressed to them. With 70 mm a skirt jumps by more than 40 mm in 1.5 % of 343 recorded frame pairs, with 80 mm in
-    0.9 %; its error is 6.9 and 7.0 mm. Cloth whose networks know where arms are (`Wearable.knows_arms`) feels limbs
-    only within the length of one of its edges: what the networks predict is closer to the truth than where a limb
-    farther off would draw the cloth."""
+    """Up to this height above its skin cloth lies on it; at twice the height it doesn't, since neighbours there lie on
+    different legs, and would tear if pressed to them [m]. Half as far to its side cloth still feels a limb, less and
+    less: a swinging hand moves 30 mm in a frame. Felt from 80 mm, a skirt is off by 7.0 mm and jumps by more than 20 mm
+    in 8.7 % of 343 recorded frame pairs; from 40 mm by 6.7 mm and in 9.3 %, from 20 mm by 6.6 mm and in 9.9 %. Cloth
+    near its skin feels limbs from less far: twice its height squared, divided by this. Cloth whose networks know where
+    arms are (`Wearable.knows_arms`) feels limbs only within the length of one of its edges: what the networks predict
+    is closer to the truth than where a limb farther off would draw the cloth."""
     strain_limit: float = 1.6
     """How many times its rest length an edge may be, unless it was predicted longer, before its ends are drawn
     together. In 116 recorded frames .0016 % of a skirt's edges are twice as long as at rest, and .026 % with a limit of

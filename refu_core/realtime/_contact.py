@@ -120,11 +120,11 @@ class ContactStage:
         """Vertices (V, 3) [m], levelled where folded over beside another garment, for joint rotations (24, 3, 3)."""
         return self._unfold[name](vertices, rotation) if name in self._unfold else vertices
 
-    def press(self, name: str, vertices: Tensor, *, was_pushed: bool = False) -> Tensor:
+    def press(self, name: str, vertices: Tensor) -> Tensor:
         """Vertices (V, 3) [m], drawn back to their skin where a limb comes between (`Press`)."""
         if not self._has_room:
             return vertices
-        return self._press[name](vertices, self._skin_below(name), was_pushed=was_pushed)
+        return self._press[name](vertices, self._skin_below(name))
 
     def _skin_below(self, name: str) -> Tensor:
         """The skin that each vertex of a garment lies on [m], shape (V, 3)."""
@@ -186,12 +186,9 @@ class ContactStage:
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         numbers, kept = done.numbers, margin
-        vertices = self.press(name, done.vertices, was_pushed=True)
-        was_drawn = vertices is not done.vertices
         if worn:
-            vertices, _ = self.lift(name, vertices, worn, goes_on=True)
+            vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
             kept = self._settings.layer_margin * margin
-        if worn or was_drawn:
             done = resolver(vertices, self.sdf, None, margin=kept)
         vertices = self._strain[name](done.vertices, raw, rest)
         was_torn = vertices is not done.vertices
@@ -200,7 +197,7 @@ class ContactStage:
         if worn:
             done = self._part(name, done, margin=kept)
         vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
-        if was_drawn or was_torn or worn:
+        if was_torn or worn:
             vertices = self._within_reach(vertices, pressed)
         vertices = self._taken_out(vertices, pressed, margin, numbers)
         if self._has_room:

@@ -80,16 +80,6 @@ def test_what_isnt_closed_is_refused(faces: np.ndarray, wanted: str) -> None:
         _ = Connectivity.of(faces).across
 
 
-def test_an_independent_set_is_one_and_leaves_nobody_alone(reference: trimesh.Trimesh) -> None:
-    mesh = Connectivity.of(reference.faces)
-    chosen = mesh.independent
-    ends = chosen[mesh.edges]
-    assert not ends.all(axis=1).any()
-    is_beside = np.zeros(mesh.n_vertices, np.bool_)
-    np.logical_or.at(is_beside, mesh.edges, ends[:, ::-1])
-    assert (chosen | is_beside).all()
-
-
 def test_what_is_remembered_is_what_is_computed() -> None:
     """By content: arrays that have changed are other arguments, and a caller's array is the caller's."""
     calls = []
