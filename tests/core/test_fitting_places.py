@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.fitting import Placing, SurfaceMesh, _fit, fit_garment, standing_pose
-from refu_core.fitting._clean import components, no_opening
+from refu_core.fitting._clean import components, no_opening, open_pieces
 from refu_core.fitting._found import Place
 from refu_core.fitting._pieces import without_floor, without_specks
 from refu_core.fitting._place import find_places
@@ -276,6 +276,15 @@ def test_specks_of_a_scan_are_left_out_and_buttons_are_not() -> None:
     assert notes == ["1 tiny pieces that float far from all the rest, as a scan's specks do, were left out"]
     np.testing.assert_array_equal(kept.vertices, together(parts[:2])[0])
     assert without_specks(kept)[1] == []
+
+
+def test_pinholes_are_no_openings() -> None:
+    """The inner side of a hoodie with pinholes was taken for cloth that faces the wrong way."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    sock = ball.vertices[ball.faces].mean(1)[:, 1] < 0.8
+    for kept, is_open in ((slice(None), False), (slice(1, None), False), (sock, True)):
+        label = np.zeros(len(ball.vertices), np.int64)
+        assert open_pieces(ball.vertices, ball.faces[kept].astype(np.int64), label).tolist() == [is_open]
 
 
 @pytest.mark.parametrize("n_panels", [1, 2])
