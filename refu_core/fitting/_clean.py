@@ -88,6 +88,7 @@ def no_opening(f: Ints) -> str:
 
 def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
     """The same surface with edges of at most `longest`: long ones are halved until none is left."""
+    n = len(mesh.vertices)
     while True:
         v, f = mesh.vertices, mesh.faces
         edges, of_corner = _edges(f)
@@ -97,8 +98,9 @@ def split_long_edges(mesh: SurfaceMesh, longest: float) -> SurfaceMesh:
         uv = mesh.uv
         new_v = np.concatenate((v, v[edges[long]].mean(1)))
         if len(new_v) > MAX_VERTICES:
-            msg = f"with edges of at most {1e3 * longest:.0f} mm the garment has more than {MAX_VERTICES} vertices; "
-            msg += "is it larger than a garment? (--unit), or allow longer edges (--longest-edge)"
+            msg = f"with edges of at most {1e3 * longest:.0f} mm the garment has more than {MAX_VERTICES} vertices, "
+            msg += f"{n} of them its own: is it larger than a garment? (--unit); or decimate it, or allow longer edges "
+            msg += "(--longest-edge)"
             raise GarmentError(msg)
         middle = np.where(long, len(v) + np.cumsum(long) - 1, -1)
         faces = _split(f, middle[of_corner])

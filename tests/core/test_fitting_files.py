@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core import FrameError, GarmentError, load_body, load_garment
 from refu_core.fitting import GarmentDetails, Placing, SurfaceMesh, fit_garment, read_surface
-from refu_core.fitting._clean import clean
+from refu_core.fitting._clean import clean, split_long_edges
 from refu_core.fitting._mesh_file import _cut_quads, _ears
 from refu_core.fitting._place import find_places
 from refu_core.garments import UvMap, save_garment
@@ -98,6 +98,12 @@ def test_a_mesh_that_is_too_fine_is_refused_before_it_is_read(tmp_path: Path) ->
     (tmp_path / "a.obj").write_text("no vertex at all" + "\nf 1 2 3" * 400_001)
     with pytest.raises(GarmentError, match="400001 triangles or more, at most 400000 are read"):
         read_surface(tmp_path / "a.obj")
+
+
+def test_what_is_too_fine_once_it_is_split_may_be_decimated() -> None:
+    v, f = cloth(TSHIRT)
+    with pytest.raises(GarmentError, match=f"{len(v)} of them its own: .* or decimate it"):
+        split_long_edges(SurfaceMesh(v, f), 0.002)
 
 
 def test_a_crowd_at_one_place_is_one_vertex() -> None:
