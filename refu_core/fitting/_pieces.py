@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from refu_core.body import JOINT_NAMES
 from refu_core.errors import GarmentError
-from refu_core.fitting._clean import clean, components, partners, rim_vertices
+from refu_core.fitting._clean import clean, components, open_pieces, partners, rim_vertices
 from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._surround import sample
@@ -146,7 +146,7 @@ def outer_sides(mesh: SurfaceMesh, posed: PosedBody) -> tuple[SurfaceMesh, list[
     Such a piece is closed and thin. Its sides are joined by hems, whose faces stand across the cloth around them.
     """
     faces, (n_pieces, label) = mesh.faces, components(mesh.faces, len(mesh.vertices))
-    piece, is_closed = label[faces[:, 0]], ~np.isin(np.arange(n_pieces), label[rim_vertices(faces)])
+    piece, is_closed = label[faces[:, 0]], ~open_pieces(mesh.vertices, faces, label)
     normals, centres = face_normals(mesh.vertices, faces), mesh.vertices[faces].mean(1)
     twice = np.linalg.norm(normals, axis=1)
     area = np.bincount(piece, twice) / 2

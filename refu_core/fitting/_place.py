@@ -54,7 +54,7 @@ with sleeves, 0.002 mm with straight arms, and 0.3 mm if elbows were bent by 10Â
 _N_POINTS = 400
 _UNIT_TOLERANCE = 0.005
 """A mesh that had to be moved keeps a known unit unless another size fits this much better, likewise."""
-_MISFIT = 2.0
+MISFIT = 2.0
 """A mesh that fits in a known unit has that unit, unless another size fits this many times as well: loose cloth would
 always fit better if it were smaller."""
 _DOUBTFUL = 0.1
@@ -126,7 +126,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
             moved = [one for one in in_units() if one.fit.is_plain]
             stands = not chosen.is_sideways or any(one.fit.is_good and not one.is_sideways for one in found)
             moved = [one for one in moved if not stands or one.faces_as(chosen)]
-            first = [one for one in moved if _MISFIT * one.cost(extent) < least] + first
+            first = [one for one in moved if MISFIT * one.cost(extent) < least] + first
         for one in first:
             yield search.told(one)
     rings = [one for one in found if one.fit.is_ring and not one.kind and not one.is_sideways]
@@ -143,7 +143,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         tiers += search.along(bodies, turns, [size / extent for size in _TRIED_SIZES], scales=True)
     # A place by convention, or else one in a known unit, comes first unless it fits much worse.
     least = min((one.cost(extent) for one in tiers if one.fit.is_good and search.knows(one)), default=math.inf)
-    scaled = [one for one in tiers if search.has_unit and not search.knows(one) and _MISFIT * one.cost(extent) >= least]
+    scaled = [one for one in tiers if search.has_unit and not search.knows(one) and MISFIT * one.cost(extent) >= least]
     tiers = [one for one in tiers if one not in scaled]
     handicap = [
         (k > 0) * TOLERANCE + (not search.knows(one) or one.fit.inside > _NOTHING) * _UNIT_TOLERANCE
@@ -165,7 +165,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     lying = [] if placing.up or placing.is_placed else search.along(bodies, LYING, units, scales=False)
     least = min((one.cost(extent) for one in (*good, *order)), default=math.inf)
     # Nobody wears a garment on a hand, or upside down, that can be worn upright.
-    lying = [one for one in lying if one.fit.is_plain and _MISFIT * one.cost(extent) < least]
+    lying = [one for one in lying if one.fit.is_plain and MISFIT * one.cost(extent) < least]
     for one in lying:
         yield search.told(one)
     if good or order or lying or any(one.fit.is_good for one in tiers):
@@ -195,8 +195,8 @@ class _Search:
         """Whether the mesh is in a unit, and wasn't scaled to a size of one."""
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         off = min(np.abs(middle).max() for middle in ((low + high) / 2, mesh.vertices.mean(0)))
-        self.has_origin = bool(placing.is_placed or off > _NORMED * self._extent)
-        """Whether its origin says where it belongs, and isn't its own middle."""
+        self.has_origin = bool(placing.is_placed or (self.has_unit and off > _NORMED * self._extent))
+        """Whether its origin says where it belongs: it is in a unit, and its origin isn't its own middle."""
 
     def too_high(self, place: Place, body: PosedBody) -> bool:
         """Whether it reaches up between the arms, where it is held at the waist, or far above the head."""
@@ -238,8 +238,9 @@ class _Search:
             start = replace(
                 place, turn=ROUND @ place.turn, shift=ROUND @ (place.shift - middle) + middle, kind="searched"
             )
-            other = self.refined(replace(start, lift=0.0), moves=True, scales=not self.knows(place))
-            if other.fit.is_good and other.cost(self._extent) < _MISFIT * place.cost(self._extent):
+            # Arms that were brought forward for the other side are so no longer.
+            other = self.refined(replace(start, lift=0.0), moves=True, scales=not self.knows(place), bends=_BENDS)
+            if other.fit.is_good and other.cost(self._extent) < MISFIT * place.cost(self._extent):
                 place = other
         return told(place)
 

@@ -13,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody
-from refu_core.fitting._clean import components, rim_vertices
+from refu_core.fitting._clean import components, open_pieces
 from refu_core.fitting._mesh_file import F64, Ints, SurfaceMesh
 from refu_core.fitting._posed import PosedBody
 from refu_core.mesh import face_normals
@@ -127,8 +127,7 @@ def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
     a, b, c = (mesh.vertices[mesh.faces[face, k]] for k in range(3))
     points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     _, label = components(mesh.faces, len(mesh.vertices))
-    open_pieces = np.unique(label[rim_vertices(mesh.faces)])
-    is_open = np.isin(label[mesh.faces[face, 0]], open_pieces)
+    is_open = open_pieces(mesh.vertices, mesh.faces, label)[label[mesh.faces[face, 0]]]
     unit = normals[face] / np.maximum(area[face], 1e-300)[:, None]
     each = np.full(count, 0.5 * area.sum() / count)
     return Samples(points, unit, is_open, label[mesh.faces[face, 0]], each)

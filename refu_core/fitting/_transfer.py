@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.spatial import cKDTree
 
-from refu_core.fitting._clean import components, rim_vertices
+from refu_core.fitting._clean import components, open_pieces, rim_vertices
 from refu_core.fitting._mesh_file import F64, Ints
 from refu_core.fitting._posed import PosedBody
 from refu_core.mesh import symmetric_solver, vertex_areas, vertex_normals
@@ -69,7 +69,7 @@ class Transfer:
         agrees = (normals * gradient).sum(1)
         n_pieces, label = components(faces, len(vertices))
         rim = rim_vertices(faces)
-        is_open = np.isin(np.arange(n_pieces), label[rim])
+        is_open = open_pieces(vertices, faces, label)
         # A closed piece is cloth with a thickness: its inner side faces the skin and follows it no less.
         agrees = np.where(is_open[label], agrees, np.abs(agrees))
         is_trusted = (agrees > _FACING) & (distance < _FARTHEST)

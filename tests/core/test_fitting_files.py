@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core import FrameError, GarmentError, load_body, load_garment
 from refu_core.fitting import GarmentDetails, Placing, SurfaceMesh, fit_garment, read_surface
-from refu_core.fitting._clean import clean
+from refu_core.fitting._clean import clean, split_long_edges
 from refu_core.fitting._mesh_file import _cut_quads, _ears
 from refu_core.fitting._place import find_places
 from refu_core.garments import UvMap, save_garment
@@ -100,6 +100,12 @@ def test_a_mesh_that_is_too_fine_is_refused_before_it_is_read(tmp_path: Path) ->
         read_surface(tmp_path / "a.obj")
 
 
+def test_what_is_too_fine_once_it_is_split_may_be_decimated() -> None:
+    v, f = cloth(TSHIRT)
+    with pytest.raises(GarmentError, match=f"{len(v)} of them its own: .* or decimate it"):
+        split_long_edges(SurfaceMesh(v, f), 0.002)
+
+
 def test_a_crowd_at_one_place_is_one_vertex() -> None:
     """Faces without area, and tiny ones, by the thousand: pairs of all of them would be hundreds of millions."""
     v, f = cloth(TSHIRT)
@@ -131,6 +137,30 @@ def test_a_stray_face_takes_nothing_with_it() -> None:
     assert notes == ["1 faces far off all others were left out"]
 
 
+def test_where_inside_becomes_outside_a_few_faces_are_left_out() -> None:
+    """A strip with half a turn closes the hole around a vertex, as in scans and bows. The whole mesh was refused."""
+    v, f = cloth(TSHIRT)
+    for middle in range(len(v) // 2, len(v)):
+        after = {
+            int(a): int(b)
+            for face in f[(f == middle).any(1)]
+            for a, b in [np.roll(face, -list(face).index(middle))[1:]]
+        }
+        if len(after) == 6 and set(after) == set(after.values()):
+            break
+    ring = [next(iter(after))]
+    while len(ring) < 6:
+        ring.append(after[ring[-1]])
+    quads = [(ring[k], ring[k + 1], ring[(k + 4) % 6], ring[k + 3]) for k in range(3)]
+    strip = np.array([half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))])
+    rest = f[(f != middle).all(1)]
+    cleaned, notes = clean(SurfaceMesh(v, np.concatenate((rest, strip))))
+    assert any("on which inside became outside were left out" in note for note in notes)
+    assert len(rest) - 6 <= len(cleaned.faces) < len(rest) + 6
+    runs = np.stack((cleaned.faces, np.roll(cleaned.faces, -1, 1)), -1).reshape(-1, 2)
+    assert len(np.unique(runs, axis=0)) == len(runs)  # neighbours face the same way
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.5])
 def test_a_sewing_pattern_is_refused(turn: float) -> None:
     panel = trimesh.creation.box(extents=(0.5, 0.7, 0.0)).subdivide().subdivide()
@@ -139,6 +169,13 @@ def test_a_sewing_pattern_is_refused(turn: float) -> None:
     c, s = np.cos(turn), np.sin(turn)
     with pytest.raises(GarmentError, match="it is flat, as a sewing pattern is"):
         fit_garment(SurfaceMesh(v @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]]), f), load_body("neutral"), name="a")
+
+
+def test_cloth_on_a_table_is_refused() -> None:
+    """A folded shirt was scaled until it lay under one foot."""
+    v, f = cloth(TSHIRT)
+    with pytest.raises(GarmentError, match="or cloth on a table"):
+        fit_garment(SurfaceMesh(v * [1, 1, 0.1], f), load_body("neutral"), name="a")
 
 
 @pytest.mark.parametrize("ease", [0.002, -0.003])

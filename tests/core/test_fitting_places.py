@@ -18,11 +18,13 @@ from scipy.spatial.transform import Rotation
 from refu_core import GarmentError, load_body, load_garment
 from refu_core.body import apply_transforms, blend_transforms
 from refu_core.fitting import Placing, SurfaceMesh, _fit, fit_garment, standing_pose
-from refu_core.fitting._clean import components, no_opening
+from refu_core.fitting._clean import components, no_opening, open_pieces
 from refu_core.fitting._found import Place
 from refu_core.fitting._pieces import without_floor, without_specks
-from refu_core.fitting._place import find_places
+from refu_core.fitting._place import _at, _Search, _Way, find_places
+from refu_core.fitting._posed import PosedBody
 from refu_core.fitting._surround import opens_behind, parts_legs
+from refu_core.fitting._ways import ROUND
 from refu_core.mesh import rim_of, vertex_normals
 
 SHIRT = Wanted(low=0.66, sleeve=0.6, step=0.028)
@@ -139,6 +141,34 @@ def test_what_cannot_be_where_it_belongs_is_worn_nowhere_else(monkeypatch: pytes
         next(find_places(narrow_tube(1.38), body, Placing(unit=1.0, up="y", is_placed=True)))
 
 
+def fitted_at(places: list[Place], mesh: SurfaceMesh, monkeypatch: pytest.MonkeyPatch) -> _fit.FittedGarment:
+    monkeypatch.setattr(_fit, "find_places", lambda *_: iter(places))
+    return fit_garment(mesh, load_body("neutral"), name="shirt", longest_edge=0.1)
+
+
+def test_a_place_that_fits_much_worse_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A two-piece suit was worn as a rag between the legs, because an arm went through a sleeve where it belongs."""
+    mesh = SurfaceMesh(*cloth(SHIRT))
+    there = next(find_places(mesh, load_body("neutral"), Placing()))
+    beside = replace(there, shift=there.shift + np.array([0.08, 0.0, 0.0]))
+    wide = replace(there, fit=replace(there.fit, distance=0.4))
+    assert fitted_at([beside, there], mesh, monkeypatch).warnings == []
+    with pytest.raises(GarmentError, match="was made for another body or pose"):
+        fitted_at([beside, wide], mesh, monkeypatch)
+
+
+def test_cloth_that_is_torn_is_worn_where_it_fits_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dresses in no unit were worn as tents in metres, with hanging arms in them, and torn as the arms were lifted."""
+    mesh = SurfaceMesh(*cloth(SHIRT))
+    there = next(find_places(mesh, load_body("neutral"), Placing()))
+    middle = there.unit * mesh.vertices.mean(0)
+    tent = replace(there, unit=2.5 * there.unit, pose=standing_pose(1.2), shift=there.shift - 1.5 * middle)
+    tent = replace(tent, fit=replace(there.fit, distance=0.3))
+    assert fitted_at([tent, there], mesh, monkeypatch).warnings == []
+    made = fitted_at([tent, replace(there, fit=replace(there.fit, distance=0.9))], mesh, monkeypatch)
+    assert any("bringing it into the T-pose stretched" in text for text in made.warnings)
+
+
 def test_cloth_that_is_torn_as_arms_are_lifted_is_doubted() -> None:
     """A loose cone over arms that hang: what lies on them goes with them, and what is beside them doesn't."""
     placing = Placing(unit=1.0, pose=standing_pose(1.2))
@@ -216,6 +246,14 @@ def test_an_origin_in_the_middle_says_nothing_of_the_place(size: float | None) -
     assert place.unit * np.ptp(v, axis=0).max() == pytest.approx(extent, rel=0.05)
 
 
+def test_the_origin_of_what_has_no_unit_says_nothing() -> None:
+    """A jacket of size 2 whose origin was nearly its middle was taken to be 2 m wide and to stand where it belongs."""
+    v, f = cloth(SHIRT)
+    v = (v - (v.min(0) + v.max(0)) / 2) * 2 / np.ptp(v, axis=0).max() + [0.0, 0.005, 0.0]
+    place = next(find_places(SurfaceMesh(v, f), load_body("neutral"), Placing()))
+    assert place.kind == "searched"
+
+
 def test_what_is_said_is_not_overruled() -> None:
     """A tube of which a third faces the other way was refused, although all was said."""
     body, mesh = load_body("neutral"), cone((0.3, -0.6), (0.3, -0.1))
@@ -278,6 +316,15 @@ def test_specks_of_a_scan_are_left_out_and_buttons_are_not() -> None:
     assert without_specks(kept)[1] == []
 
 
+def test_pinholes_are_no_openings() -> None:
+    """The inner side of a hoodie with pinholes was taken for cloth that faces the wrong way."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    sock = ball.vertices[ball.faces].mean(1)[:, 1] < 0.8
+    for kept, is_open in ((slice(None), False), (slice(1, None), False), (sock, True)):
+        label = np.zeros(len(ball.vertices), np.int64)
+        assert open_pieces(ball.vertices, ball.faces[kept].astype(np.int64), label).tolist() == [is_open]
+
+
 @pytest.mark.parametrize("n_panels", [1, 2])
 def test_cloth_with_two_sides_is_worn_with_its_outer_one(n_panels: int) -> None:
     """Trousers 3 mm thick, closed along their hems, in one piece or in panels that touch; a button on them is whole."""
@@ -323,6 +370,16 @@ def test_a_coat_opens_in_front(up: str) -> None:
     base = {"y": np.eye(3), "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}[up]
     place = next(find_places(SurfaceMesh(v @ base, f), body, Placing()))
     np.testing.assert_allclose(place.turn, base, atol=1e-9)
+
+
+def test_what_is_turned_round_is_posed_anew() -> None:
+    """A blouse stayed back to front: its arms, brought forward for that, were behind it as it was turned round."""
+    body, mesh = load_body("neutral"), SurfaceMesh(*cloth(replace(SHIRT, sleeve=0.9, is_open=True, arms=0.6)))
+    search = _Search(mesh, body, Placing(), [1.0])
+    way = _Way(1.0, ROUND, "searched", np.array([0.0, -1.117, 0.07]))
+    place = search.told(_at(search.samples, [way], PosedBody(body, standing_pose(0.6, forward=0.5)))[0])
+    np.testing.assert_array_equal(place.turn, np.eye(3))
+    assert place.pose[17, 1] == pytest.approx(0.0, abs=0.1)
 
 
 def test_a_scanned_person_stands_askew() -> None:
