@@ -37,8 +37,8 @@ _GRACE_S = 5.0
 """How long the inputs stay subscribed to after the last viewer has left: many viewers are only restarted [s]."""
 _TF, _TF_STATIC = "/tf", "/tf_static"
 _TF_DEPTH = 100
-_TURN_S = 0.005
-"""How long transforms are taken before it is another's turn [s]: most messages are small, and there are many."""
+TURN_S = 0.005
+"""How long transforms are taken, or publishers made, before it is another's turn [s]: of a crowd there are many."""
 _RETRY_S = 0.02
 """How often it is looked whose wait for a transform is over, when neither inputs nor transforms come [s]."""
 
@@ -320,7 +320,7 @@ class Listener:
         self._tf, self._tf_asked_at = adapters.TransformBuffer(), time.monotonic()
 
     def _on_transforms(self, waiting: deque[bytes], *, is_static: bool) -> None:
-        refused, last = list[str](), time.monotonic() + _TURN_S
+        refused, last = list[str](), time.monotonic() + TURN_S
         self._now_ns()
         try:
             while waiting and time.monotonic() < last:

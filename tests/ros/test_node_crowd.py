@@ -11,6 +11,7 @@ from collections import deque
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -216,6 +217,28 @@ def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypat
     report = node.statistics.report()
     assert (report.total["received"], report.total["drop.stale"]) == (100, 100 - INPUT_QOS.depth)
     listener.unsubscribe()
+    executor.remove_node(node)
+
+
+def test_a_crowds_topics_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of 64 people who came at once held up all else for two seconds, and again with each 64 new names."""
+    executor, there, persons = make_executor(), list[int](), [f"p{i}" for i in range(20)]
+    executor.add_node(node)
+    node.trigger_configure()
+    node._worker = SimpleNamespace(fittings=node._fittings, stop=lambda: None)
+    monkeypatch.setattr(NodeListener, "persons", persons)
+    known = node._bank._publishers
+    node._hold_topics()
+    for _ in range(3):
+        executor.create_task(lambda: there.append(len(known)))
+
+    wanted = {topic for one in node._outputs for topic in one.topics(persons, node._fittings) if topic[0] == "p"}
+    while len(there) < 3 or not wanted <= known.keys():
+        executor.spin_once(timeout_sec=0.1)
+    assert max(there) < len(known) / 2
+    monkeypatch.setattr(NodeListener, "persons", [])
+    node._hold_topics()
+    assert not wanted & known.keys()
     executor.remove_node(node)
 
 
