@@ -122,6 +122,12 @@ class _Track:
         old = max(bisect_left(self.stamps, stamp_ns - HISTORY_NS), len(self.stamps) - most)
         del self.stamps[:old], self.values[:old]
 
+    def cut(self, stamp_ns: int) -> int:
+        """Leaves out later transforms; returns how many remain."""
+        at = bisect_right(self.stamps, stamp_ns)
+        del self.stamps[at:], self.values[at:]
+        return at
+
     def at(self, stamp_ns: int, tolerance_ns: int, child: str) -> Placement:
         """The placement at that time, between the two transforms around it. Raises `TransformError`."""
         after, is_late = bisect_right(self.stamps, stamp_ns), False
@@ -210,6 +216,12 @@ class TransformBuffer:
         self._heard.add(child)
         return ""
 
+    def rewind(self, now_ns: int) -> None:
+        """Forgets what is stamped later: the clock was set back, and people of that time are yet to come."""
+        for child, track in [*self._tracks.items()]:
+            if not track.is_static and not track.cut(now_ns):
+                del self._tracks[child]
+
     def lookup(self, target: str, source: str, stamp_ns: int, *, tolerance_ns: int = 0) -> Placement:
         """Where points of `source` were in `target` at that time.
 
@@ -237,7 +249,8 @@ class TransformBuffer:
         Raises `TransformError` where there is none, or the way goes along a ring: which of two ways is meant?
         """
         ways = self._way(source.lstrip("/")), self._way(target.lstrip("/"))
-        common = next((frame for frame in ways[0] if frame in ways[1]), None)
+        above = {*ways[1]}
+        common = next((frame for frame in ways[0] if frame in above), None)
         up, down = (way if common is None else way[: way.index(common)] for way in ways)
         for way in ways:
             ring = self._ring(way)
@@ -251,10 +264,11 @@ class TransformBuffer:
 
     def _way(self, frame: str) -> list[str]:
         """The frame and its ancestors, up to a root or, if they form a ring, once around it."""
-        way = [frame]
-        while len(way) <= _LONGEST_WAY and (track := self._tracks.get(way[-1])) is not None and track.parent not in way:
-            way.append(track.parent)
-        return way
+        way = {frame: None}  # in order, and sought in no time: it is followed for each frame that waits
+        while len(way) <= _LONGEST_WAY and (track := self._tracks.get(frame)) is not None and track.parent not in way:
+            frame = track.parent
+            way[frame] = None
+        return [*way]
 
     def _ring(self, way: list[str]) -> list[str]:
         """The ring that a way ends in, or nothing."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -28,8 +30,10 @@ class Bank:
         self._publishers: dict[str, Any] = {}
         self._refused: set[str] = set()
 
-    def hold(self, wanted: Mapping[str, str], *, lasting: bool = False) -> None:
+    def hold(self, wanted: Mapping[str, str], *, lasting: bool = False, until: float = math.inf) -> bool:
         """Keeps publishers of these topics, given with their types, and no others except those that are `lasting`.
+
+        Making one takes milliseconds, a crowd's seconds: returns whether it was done `until` then [s], or is to go on.
 
         Only lasting ones have QoS overrides: these are parameters, which are never removed. A type whose package is
         missing is left out and logged once. A topic whose name is too long is left out and counts as a fault.
@@ -37,6 +41,8 @@ class Bank:
         for topic, kind in wanted.items():
             if topic in self._publishers or kind in self._refused:
                 continue
+            if time.monotonic() > until:
+                return False
             try:
                 message_class = interface(kind)
             except RefuError as error:
@@ -58,6 +64,7 @@ class Bank:
             self._publishers[topic] = publisher
         for topic in [topic for topic, one in self._publishers.items() if topic not in wanted and not one.lasts]:
             self._node.destroy_lifecycle_publisher(self._publishers.pop(topic))
+        return True
 
     def name(self, topic: str) -> str:
         """A topic's full name, after remapping."""

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from refu_core.outputs import Fittings
     from refu_core.realtime import PipelineOutput
 
+Use = Callable[["Fittings", PipelineOptions], object]
+Fail = Callable[[Exception, PipelineOptions], object]
 Then = Callable[["PipelineOutput", dict[str, NDArray[np.float64]]], object]
 
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -68,13 +70,7 @@ def load(options: PipelineOptions, *, threads: int = 1) -> Fittings:
 class PipelineLoader:
     """A thread that loads the pipeline asked for last; earlier requests that it didn't get to are dropped."""
 
-    def __init__(
-        self,
-        use: Callable[[Fittings, PipelineOptions], None],
-        fail: Callable[[Exception, PipelineOptions], None],
-        *,
-        threads: int,
-    ) -> None:
+    def __init__(self, use: Use, fail: Fail, *, threads: int) -> None:
         self._use, self._fail, self._threads = use, fail, threads
         self.wanted: PipelineOptions | None = None
         self._pool = ThreadPoolExecutor(1, "loader")

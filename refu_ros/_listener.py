@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 INPUT_QOS = adapters.QosProfile(reliability="best_effort", depth=5)
 _HUMANS = re.compile(r"/humans/bodies/([A-Za-z][A-Za-z0-9_]{0,99})/joint_states")
-_TRACKED = "/humans/bodies/tracked"
+_TRACKED, _CAMERA = "/humans/bodies/tracked", "/camera"
 _GRACE_S = 5.0
 """How long the inputs stay subscribed to after the last viewer has left: many viewers are only restarted [s]."""
 _TF, _TF_STATIC = "/tf", "/tf_static"
 _TF_DEPTH = 100
-_TURN_S = 0.005
-"""How long transforms are taken before it is another's turn [s]: most messages are small, and there are many."""
+TURN_S = 0.005
+"""How long transforms are taken, or publishers made, before it is another's turn [s]: of a crowd there are many."""
 _RETRY_S = 0.02
 """How often it is looked whose wait for a transform is over, when neither inputs nor transforms come [s]."""
 
@@ -60,6 +60,9 @@ class Listener:
         self._wanted_at = 0.0
         self._inputs: dict[str, Any] = {}
         self._frames: dict[str, str] = {}
+        self._heard: dict[str, float] = {}
+        """When somebody's message came last, on the steady clock [s]; of the same people as `_frames`."""
+        self._latest_ns = 0
         self._tracked: set[str] | None = None
         self._topics: list[Any] = []
         """All that there were when they could last be named: rclpy can't while a peer has one that isn't UTF-8."""
@@ -131,7 +134,7 @@ class Listener:
             for person in self._settings.persons:
                 self._listen(person, f"{person}/{adapters.SMPL_TOPIC}" if person else adapters.SMPL_TOPIC)
         if topic := self._settings.camera_info:
-            self._hear("/camera", adapters.CAMERA_INFO, topic, self._on_camera, ros_qos(INPUT_QOS))
+            self._hear(_CAMERA, adapters.CAMERA_INFO, topic, self._on_camera, ros_qos(INPUT_QOS))
 
     def unsubscribe(self) -> None:
         if self._inputs:
@@ -162,7 +165,14 @@ class Listener:
             if name in self._inputs:  # else the executor had taken it before nobody listened
                 take(data)
 
-        self._inputs[name] = self._node.create_subscription(interface(kind), topic, come, qos, raw=True, **options)
+        message_class = interface(kind)
+        try:
+            self._inputs[name] = self._node.create_subscription(message_class, topic, come, qos, raw=True, **options)
+        except Exception as error:  # rclpy's own say nothing of it
+            what = f"can't subscribe to {self._node.resolve_topic_name(topic)} as {kind}"
+            raise RefuError(
+                f"{what}: is it remapped to a topic of another type, or no name of one? ({error})"
+            ) from error
 
     def _come(self, person: str, topic: str, data: bytes) -> None:
         """Records a message and lets it wait for its turn.
@@ -220,8 +230,10 @@ class Listener:
         known = {name: frame_id for name, frame_id in self._frames.items() if name not in given}
         # A tracker's names may never come again: the oldest are forgotten.
         self._frames = dict([*known.items(), *given.items()][-self.room :])
-        for name, frame in frames.items() if not self.is_steady else ():
-            self._put(name, frame, topic)
+        came = self._heard | dict.fromkeys(given, time.monotonic())
+        self._heard = {name: came[name] for name in self._frames}
+        if not self.is_steady:
+            self._put(frames, topic)
 
     def _refuse(self, source: str, error: Exception) -> None:
         self._node.statistics.drop("invalid", str(error))
@@ -230,22 +242,33 @@ class Listener:
     def predict(self) -> None:
         """Puts predicted frames of everybody whose keypoints are followed into the scene."""
         if self.scene is not None and self._node.is_watched():
-            for name, frame in self.stream.predicted(self._node.now_ns()).items():
-                self._put(name, frame, f"predicted {name}")
+            # Where ROS time stands still nobody's keypoints grow old, whoever sends them may have gone all the same.
+            since, found = time.monotonic() - self._settings.person_timeout, self.stream.predicted(self._node.now_ns())
+            here = {name: frame for name, frame in found.items() if self._heard.get(name, since) > since}
+            self._put(here, "predicted")
 
-    def _put(self, person: str, frame: SmplFrame, source: str) -> None:
-        try:
-            adapters.check_plausible(frame)
-        except FrameError as error:
-            self._refuse(source, error)
-            return
-        given = "" if self.is_untransformed else self._frames.get(person)
-        self._waiting.put(adapters.Held(person, frame, given or self._settings.frame_id, self._node.now_ns()))
+    def _put(self, frames: dict[str, SmplFrame], source: str) -> None:
+        for person, frame in frames.items():
+            try:
+                adapters.check_plausible(frame)
+            except FrameError as error:
+                self._refuse(source, error)
+                continue
+            given = "" if self.is_untransformed else self._frames.get(person)
+            self._waiting.put(adapters.Held(person, frame, given or self._settings.frame_id, self._node.now_ns()))
         self._place()
+
+    def _now_ns(self) -> int:
+        """ROS time [ns]; if it has gone back, where things were later is forgotten: that was another time."""
+        now = self._node.now_ns()
+        if now < self._latest_ns:
+            self._tf.rewind(now)
+        self._latest_ns = now
+        return now
 
     def _place(self) -> None:
         """Puts those who wait no longer for their transform into the scene."""
-        axes, target, now = self._settings.axes, self._settings.frame_id, self._node.now_ns()
+        axes, target, now = self._settings.axes, self._settings.frame_id, self._now_ns()
         for one, placement in self._waiting.ready(self._tf, target, now, self._settings.tolerance_ns):
             seen_in = self._frames.get(one.person) if self.is_untransformed else ""
             up = up_of_sender(axes, seen_in or target, placement.rotation).astype(np.float32)
@@ -260,7 +283,7 @@ class Listener:
     def _camera_at(self, person: str, stamp_ns: int) -> PinholeCamera | None:
         """The camera where it was when this person was seen; None if there is none, or no transform of it."""
         settings, camera = self._settings, self._camera
-        if camera is None or not self._node.count_publishers(settings.camera_info):
+        if camera is None or not self._node.count_publishers(self._inputs[_CAMERA].topic_name):
             return None
         is_theirs = camera.frame_id == self._frames.get(person) and (self.is_untransformed or not camera.frame_id)
         given, tolerance = settings.frame_id if is_theirs else camera.frame_id, settings.tolerance_ns
@@ -297,7 +320,8 @@ class Listener:
         self._tf, self._tf_asked_at = adapters.TransformBuffer(), time.monotonic()
 
     def _on_transforms(self, waiting: deque[bytes], *, is_static: bool) -> None:
-        refused, last = list[str](), time.monotonic() + _TURN_S
+        refused, last = list[str](), time.monotonic() + TURN_S
+        self._now_ns()
         try:
             while waiting and time.monotonic() < last:
                 refused += self._tf.put(waiting.popleft(), is_static=is_static)
@@ -310,7 +334,9 @@ class Listener:
 
     def _bodies(self) -> dict[str, str]:
         """The topic of each body that there is: of those announced as tracked, or of all if nothing is announced."""
-        self._topics, count, tracked = self._name_topics(), self._node.count_publishers, self._tracked
+        self._topics, count = self._name_topics(), self._node.count_publishers
+        told = self._inputs.get(_TRACKED)  # who announced people and has gone doesn't know who comes
+        tracked = self._tracked if told is not None and count(told.topic_name) else None
         found = ((match[1], topic) for topic, _ in self._topics if (match := _HUMANS.fullmatch(topic)))
         bodies = [one for one in found if (tracked is None or one[0] in tracked) and count(one[1])]
         if len(bodies) > self.room:

@@ -24,7 +24,7 @@ from refu_ros._beside import PipelineLoader, load
 from refu_ros._diagnostics import Situation, statuses
 from refu_ros._guard import LOG_PERIOD_S, GuardedNode, transition
 from refu_ros._interfaces import interface
-from refu_ros._listener import Listener
+from refu_ros._listener import TURN_S, Listener
 from refu_ros._requests import Requests
 from refu_ros._settings import NodeSettings, declare, parameter
 
@@ -203,9 +203,12 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _hold_topics(self) -> None:
         """Keeps the publishers for everybody who may come, in what they wear."""
-        assert self._worker is not None
+        if self._worker is None:  # it was deactivated meanwhile
+            return
         persons, fittings = self._listener.persons, self._worker.fittings
-        self._bank.hold({topic: one.message_type for one in self._outputs for topic in one.topics(persons, fittings)})
+        wanted = {topic: one.message_type for one in self._outputs for topic in one.topics(persons, fittings)}
+        if not self._bank.hold(wanted, until=time.monotonic() + TURN_S) and self.executor is not None:
+            self.executor.create_task(self._hold_topics)
 
     def device_lost(self, reason: str) -> None:
         """Goes on on the CPU, or ends, as `on_device_loss` says."""

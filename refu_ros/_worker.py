@@ -285,11 +285,5 @@ class Worker:
             self._publish(row.gone(gone, self._moment(self.settings)))
 
     def _moment(self, settings: NodeSettings) -> Moment:
-        return Moment(
-            settings.frame_id,
-            settings.lifetime_ns,
-            settings.points_fields,
-            settings.planner_rate,
-            self._outlet.watchers,
-            self._outlet.now_ns(),
-        )
+        told = settings.frame_id, settings.lifetime_ns, settings.points_fields, settings.planner_rate
+        return Moment(*told, self._outlet.watchers, self._outlet.now_ns())

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+from msg_adapters import QosProfile
 from refu_core import RefuError
 from refu_ros._program import make_room
 
@@ -14,7 +15,7 @@ from refu_ros._program import make_room
 class LiveTopics:
     """Subscribes to topics, by message type; each message goes to `take(topic, data)`, from one thread.
 
-    Use it as a context manager, or `close` it. Raises `RefuError` where rclpy isn't there, and for names that no topic
+    `close` it when it is done with. Raises `RefuError` where rclpy isn't there, and for names that no topic
     has.
     """
 
@@ -25,7 +26,7 @@ class LiveTopics:
             from rclpy.executors import SingleThreadedExecutor
             from rclpy.signals import SignalHandlerOptions
 
-            from refu_ros._interfaces import interface
+            from refu_ros._interfaces import interface, ros_qos
         except ImportError as error:
             raise RefuError(f'source a ROS 2 installation, or pip install "refu-ros[ros]" ({error})') from error
         self._context = rclpy.Context()
@@ -33,8 +34,10 @@ class LiveTopics:
             rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             node = rclpy.create_node("refu_view", context=self._context, enable_rosout=False)
             self._node: Any = node
+            # Whoever publishes serves this; a reliable subscription would get nothing from a best-effort publisher.
+            qos = ros_qos(QosProfile(reliability="best_effort", depth=1))
             for topic, kind in topics.items():
-                node.create_subscription(interface(kind), topic, partial(take, topic), 1, raw=True)
+                node.create_subscription(interface(kind), topic, partial(take, topic), qos, raw=True)
         except Exception as error:
             self._context.try_shutdown()
             raise RefuError(f"no topics {', '.join(topics)}: {error}") from error
@@ -42,12 +45,6 @@ class LiveTopics:
         self._executor.add_node(node)
         self._thread = threading.Thread(target=self._executor.spin, name="topics", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> LiveTopics:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         self._executor.shutdown()

@@ -1065,6 +1065,15 @@ def test_what_is_due_again_is_not_remembered() -> None:
     assert [is_due(due, "p/mesh", seldom) for _ in range(3)] == [True, False, False]  # type: ignore[arg-type]
 
 
+def test_the_rate_of_now_says_when_a_planner_is_sent_its_next_mesh() -> None:
+    """It was the rate at the last mesh: after one of 1e-300 Hz planners were never sent another."""
+    seldom, often = (SimpleNamespace(planner_rate=rate) for rate in (1e-300, 1e3))
+    sent: dict[str, float] = {}
+    assert [is_due(sent, "p/mesh", seldom) for _ in range(2)] == [True, False]  # type: ignore[arg-type]
+    time.sleep(0.002)
+    assert is_due(sent, "p/mesh", often)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("fields", [["colour"], ["normal", "x"]])
 def test_points_have_fields_that_there_are(fields: list[str]) -> None:
     assert NodeSettings().changed({"points_fields": ["normal"]}).points_fields == ("normal",)

@@ -20,6 +20,8 @@ from refu_core.errors import printable
 
 BAG_SUFFIXES = (".mcap", ".db3")
 _MAX_WARNINGS = 20
+_FOREIGN = {b"#ROSBAG": "convert it with `rosbags-convert`", b"\x28\xb5\x2f\xfd": "unpack it with `zstd -d`"}
+"""What to do with other files, by their first bytes."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class BagReader:
     """Streams a bag, one chunk in memory at a time.
 
     A file without its closing records (a recorder that was killed) and damaged chunks aren't errors: what can be read
-    is read, and `truncated` and `warnings` say what couldn't be. The cost of a pass is bounded by the bag's size; see
-    `_mcap.Budget`.
+    is read, and `truncated` and `warnings` say what couldn't be. Nor are files of a directory that aren't there or
+    can't be read, as long as one can. The cost of a pass is bounded by the bag's size; see `_mcap.Budget`.
 
     Raises `BagError` when there is no such bag, or it is neither MCAP nor rosbag2's SQLite.
     """
@@ -54,7 +56,17 @@ class BagReader:
         self._claimed = False
         """Whether message counts were taken from a summary."""
         self._size = 0
-        self._files = [self._open(path) for path in self._find_files()]
+        self._files: list[McapFile | SqliteFile] = []
+        errors = []
+        for path in self._find_files():
+            try:
+                self._files.append(self._open(path))
+            except BagError as error:  # noqa: PERF203 - a file is missing, or empty after a power cut: others hold most
+                errors.append(error)
+        if not self._files:
+            raise errors[0]
+        self._notes += [printable(f"left out: {error}") for error in errors[:_MAX_WARNINGS]]
+        self.truncated = bool(errors)
         self._topics: tuple[TopicInfo, ...] | None = None
 
     def __enter__(self) -> BagReader:
@@ -80,7 +92,7 @@ class BagReader:
             files = read_file_paths(self.path)
         else:
             try:
-                files = sorted((f for f in self.path.iterdir() if f.suffix in BAG_SUFFIXES), key=_by_number)
+                files = sorted(filter(_is_of_bag, self.path.iterdir()), key=_by_number)
             except OSError as error:
                 raise BagError(f"{self.path}: can't be read: {error.strerror}") from error
             missing = f"no {METADATA_FILE} (was the recording interrupted?); its files are read by name"
@@ -98,7 +110,7 @@ class BagReader:
             return SqliteFile(path, report)
         if start.startswith(MAGIC):
             return McapFile(path, report)
-        hint = "convert it with `rosbags-convert`" if start.startswith(b"#ROSBAG") else f"wanted {WANTED_FILE}"
+        hint = next((hint for magic, hint in _FOREIGN.items() if start.startswith(magic)), f"wanted {WANTED_FILE}")
         wanted = "SQLite" if path.suffix == ".db3" else "MCAP"
         raise BagError(f"{path}: not an {wanted} file; {hint}")
 
@@ -154,6 +166,10 @@ class BagReader:
                     file.report(DamageError("a message on {} at a time that ROS can't hold", topic.name))
                 elif topics is None or topic.name in topics:
                     yield BagMessage(topic.name, topic.message_type, log_ns, publish_ns, bytes(data))
+
+
+def _is_of_bag(path: Path) -> bool:
+    return Path(path.name.removesuffix(".zstd")).suffix in BAG_SUFFIXES
 
 
 def _by_number(path: Path) -> list[Any]:

@@ -56,6 +56,9 @@ class SmplBag:
         for message in self.reader.messages({self.topic.name}):
             frame, error = None, None
             try:
+                if message.message_type != self.topic.message_type:  # two publishers' types, or a newer recording's
+                    got = message.message_type or "a message without a type"
+                    raise DecodeError(f"wanted {self.topic.message_type}, got {got}")
                 if self.decoder is not None:
                     frame = self.decoder.from_bytes(message.data)
                     if not frame.stamp_ns:  # then the time of its receipt is used

@@ -126,8 +126,8 @@ class Apart(Output):
     encode: Callable[[DressedPerson, Any, Moment], bytes]
     slow: bool = False
     """Whether these are planners' meshes, at most `planner_rate` a second; the argument is then the garment."""
-    due: dict[str, float] = field(default_factory=dict)
-    """When each topic of planners' meshes is due next."""
+    sent: dict[str, float] = field(default_factory=dict)
+    """When each topic of planners' meshes was sent last."""
 
     def topics(self, persons: Iterable[str], fittings: Fittings | None) -> list[str]:
         if fittings is None:
@@ -140,21 +140,21 @@ class Apart(Output):
                 topic = garment_namespace(place, one.person)
                 if not moment.watchers(topic):
                     continue
-                if not self.slow or (one.fittings.has_planner(what) and is_due(self.due, topic, moment)):
+                if not self.slow or (one.fittings.has_planner(what) and is_due(self.sent, topic, moment)):
                     yield topic, self.encode(one, what, moment)
 
     def forget(self) -> None:
-        self.due.clear()
+        self.sent.clear()
 
 
-def is_due(due: dict[str, float], key: str, moment: Moment) -> bool:
-    """Whether `key` is due at the planner's rate; if so, its wait begins anew. What is due isn't kept: people leave."""
-    now = time.monotonic()
-    for passed in [name for name, at in due.items() if at <= now]:
-        del due[passed]
-    if key in due:
+def is_due(sent: dict[str, float], key: str, moment: Moment) -> bool:
+    """Whether `key` is due, at the rate of now; if so, it counts as sent. What is due isn't kept: people leave."""
+    now, period = time.monotonic(), 1 / moment.planner_rate if moment.planner_rate else 0.0
+    for passed in [name for name, at in sent.items() if at + period <= now]:
+        del sent[passed]
+    if key in sent:
         return False
-    due[key] = now + (1 / moment.planner_rate if moment.planner_rate else 0.0)
+    sent[key] = now
     return True
 
 
@@ -170,7 +170,7 @@ class Obstacles(Output):
 
     def __init__(self) -> None:
         self._sent: dict[str, list[str]] = {}
-        self._due: dict[str, float] = {}
+        self._sent_at: dict[str, float] = {}
 
     def messages(self, worn: Sequence[DressedPerson], moment: Moment) -> Messages:
         if not moment.watchers(self.topic):
@@ -180,7 +180,7 @@ class Obstacles(Output):
             if not all(fittings.has_planner(name) or name in fittings.without_planner for name in fittings.names):
                 return  # not before all are ready
         for one in worn:
-            if not is_due(self._due, one.person, moment):
+            if not is_due(self._sent_at, one.person, moment):
                 continue
             garments = [name for name in one.fittings.names if name not in one.fittings.without_planner]
             names = [garment_namespace(name, one.person) for name in garments]

@@ -291,6 +291,52 @@ def test_bad_messages_are_records_and_the_rest_goes_on(tmp_path: Path) -> None:
         assert (len(repr(record).splitlines()), len(repr(record)) < 300) == (1, True)
 
 
+def test_messages_of_another_type_on_the_topic_are_named(tmp_path: Path) -> None:
+    """They were read as what they aren't, each with a reason of its own that named no type."""
+    kinds = "joint_state", "pose_array"
+    with (tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        for i in range(6):
+            kind = kinds[i % 2]
+            schema = writer.register_schema(INPUT_TYPES[kind], "ros2msg", b"")
+            channel = writer.register_channel(TOPIC, "cdr", schema)
+            writer.add_message(channel, START_NS + i, encoder_for(kind)(frame(i)), START_NS + i)
+        writer.finish()
+    bag = open_smpl_bag(tmp_path / "two.mcap")
+    said = [str(record.error) for record in bag if record.error is not None]
+    assert said == [f"wanted {INPUT_TYPES['joint_state']}, got {INPUT_TYPES['pose_array']}"] * 3
+
+
+@pytest.mark.parametrize("last", ["missing", "empty", "packed"])
+@pytest.mark.parametrize("listed", [True, False])
+def test_one_file_that_cannot_be_read_costs_nothing_else(tmp_path: Path, last: str, *, listed: bool) -> None:
+    """A recorder opens the next file of a split bag, and the power fails: none of the bag could be read."""
+    first = write_bag(tmp_path / "bag")
+    second = first.with_name("bag_1.mcap")
+    metadata = first.with_name("metadata.yaml")
+    if listed:
+        metadata.write_text(metadata.read_text().replace("- bag_0.mcap\n", "- bag_0.mcap\n  - bag_1.mcap\n"))
+    else:
+        metadata.unlink()
+    if last == "empty":
+        second.touch()
+    elif last == "packed":
+        second = second.with_name("bag_1.mcap" if listed else "bag_1.mcap.zstd")
+        second.write_bytes(zstandard.compress(first.read_bytes()))
+    elif not listed:
+        second.symlink_to("nowhere")
+    reader = BagReader(tmp_path / "bag")
+    assert len([*reader.messages()]) == 40
+    assert reader.truncated
+    (said,) = (line for line in reader.warnings if "left out" in line)
+    assert str(second) in said
+    assert ("zstd -d" in said) == (last == "packed")
+    first.unlink()
+    with pytest.raises(BagError, match="bag_"):
+        BagReader(tmp_path / "bag")
+
+
 def test_a_message_received_at_an_impossible_time(tmp_path: Path) -> None:
     data = encoder_for("multiarray")(frame(0))
     path = tmp_path / "late.mcap"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from itertools import pairwise
 from typing import Any
 
@@ -215,6 +216,40 @@ def test_history_is_bounded_and_a_clock_may_go_back() -> None:
     put(buffer, transform("odom", "cam", 4 * S))  # another parent: what was known of the one before is over
     with pytest.raises(TransformError):
         buffer.lookup("map", "cam", 5 * S)
+
+
+def test_frames_that_wait_in_a_crowd_of_frames_cost_little() -> None:
+    """Each way was sought through its own length for each of its steps: a message cost seconds, then a minute."""
+
+    def seconds(n: int) -> float:
+        buffer, waiting = TransformBuffer(), MessageFilter(Statistics())
+        put(buffer, *(transform(f"{side}{i}", f"{side}{i + 1}") for side in "ab" for i in range(n)))
+        put(
+            buffer, transform("root", "a0"), transform("root", "b0"), *(transform(f"a{n}", f"c{i}") for i in range(640))
+        )
+        for i in range(640):
+            waiting.put(Held(f"p{i % 64}", SmplFrame(np.zeros((24, 3)), stamp_ns=S), f"c{i}", 0))
+        begun = time.perf_counter()
+        assert not [*waiting.ready(buffer, f"b{n}", 1, S)]
+        return time.perf_counter() - begun
+
+    assert min(seconds(95) for _ in range(3)) < 30 * min(seconds(2) for _ in range(3))
+
+
+def test_where_things_were_later_is_forgotten_when_the_clock_is_set_back() -> None:
+    """What is sent anew was placed where things had been at that time before."""
+    buffer = TransformBuffer()
+    put(buffer, transform("cam", "lens"), is_static=True)
+    for tenths in range(80):
+        put(buffer, transform("map", "odom", tenths * S // 10, 1), transform("odom", "cam", tenths * S // 10, 2))
+    put(buffer, transform("map", "late", 5 * S))
+    buffer.rewind(2 * S)
+    assert buffer.known_until("map", "lens") == 2 * S
+    with pytest.raises(TransformError, match=r"0\.500 s older than the input"):
+        buffer.lookup("map", "lens", 2 * S + 500 * MS)
+    buffer.lookup("map", "lens", 2 * S)
+    with pytest.raises(TransformError, match="no transform leads from late"):
+        buffer.lookup("map", "late", 2 * S)
 
 
 def test_frames_of_people_who_have_left_are_forgotten() -> None:

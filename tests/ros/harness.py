@@ -249,8 +249,9 @@ class Peer:
 class NodeHere:
     """A node in this process, and a peer that doesn't watch yet; both move when the test waits."""
 
-    def __init__(self, *persons: str, executor: Any = None, **parameters: Any) -> None:
-        self.node = GarmentNode(cli_args=ros_arguments(parameters))
+    def __init__(self, *persons: str, executor: Any = None, remaps: Sequence[str] = (), **parameters: Any) -> None:
+        renamed = [word for remap in remaps for word in ("-r", remap)]
+        self.node = GarmentNode(cli_args=[*ros_arguments(parameters), *renamed])
         self.peer = Peer(*persons)
         self.peer.unwatch()
         self._executor = executor or make_executor()

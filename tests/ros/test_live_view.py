@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): no node 
 import browser
 import rclpy
 from harness import PATIENCE_S
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from visualization_msgs.msg import MarkerArray
 
 import msg_adapters as adapters
@@ -40,13 +40,15 @@ pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"
 class Node:
     """Sends a garment's markers, as the node does."""
 
-    def __init__(self) -> None:
+    def __init__(self, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> None:
         garment = load_garment("tshirt-male")
         self.rest = garment.v_template.numpy()
         mesh = adapters.MarkerMesh("tshirt-male", garment.faces.numpy(), len(self.rest), color=(0.1, 0.7, 0.5, 1.0))
         self._encoder = adapters.MarkerArrayEncoder([mesh])
         self._node = rclpy.create_node("dresser")
-        self._publisher = self._node.create_publisher(MarkerArray, "garments", QoSProfile(depth=5))
+        self._publisher = self._node.create_publisher(
+            MarkerArray, "garments", QoSProfile(depth=5, reliability=reliability)
+        )
 
     def send(self, x: float, stamp_ns: int) -> None:
         """A T-shirt, so far along SMPL's x."""
@@ -101,6 +103,16 @@ def test_a_film_shows_what_is_published_and_not_who_has_left(node: Node) -> None
         node.until(lambda: not film.shapes(0), node.leave)
     finally:
         film.close()
+
+
+def test_a_best_effort_publisher_is_heard_too(ros: None) -> None:  # noqa: ARG001
+    """As the guide has it for garments: nothing came, and nothing was shown."""
+    node, film = Node(ReliabilityPolicy.BEST_EFFORT), LiveFilm(["garments"])
+    try:
+        node.until(lambda: bool(film.shapes(0)), lambda: node.send(0.0, 10**9))
+    finally:
+        film.close()
+        node.close()
 
 
 def test_who_leaves_before_the_viewer_begins_does_not_end_it(node: Node) -> None:

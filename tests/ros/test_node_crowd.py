@@ -6,9 +6,12 @@ import ctypes
 import gc
 import shutil
 import threading
+import time
+from collections import deque
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +29,15 @@ from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
 import refu_core
-from msg_adapters import MARKER_ARRAY
+from msg_adapters import MARKER_ARRAY, TransformError
 from msg_adapters.markers import encode_lists
 from msg_adapters.scene import Scene
-from refu_core import load_body
+from msg_adapters.transforms import Transform, encode_transforms
+from refu_core import RefuError, load_body
 from refu_core.keypoints import MOST_PEOPLE, Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3
 from refu_ros._listener import INPUT_QOS
+from refu_ros._listener import Listener as NodeListener
 from refu_ros._node import GarmentNode
 from refu_ros._program import make_executor
 
@@ -130,6 +135,69 @@ def test_what_is_asked_for_again_before_it_is_taken_back_is_tried_again(node: An
     assert node._in_use.weights == node.settings.weights == str(tmp_path)
 
 
+def keypoints(*persons: str) -> bytes:
+    """A message of people's keypoints, all in one place."""
+    bones = Skeleton(keypoint_layout("coco17"), Proportions.builtin("male"))
+    points = bones.posed(Pose(np.array([0.0, 0.0, 3.0]), exp_so3(np.zeros((24, 3))), np.zeros(10))).points
+    lists = [(person, 10**9, [0.0] * 6 + [1.0], points) for person in persons]
+    return encode_lists(7, lists, frame_id="map", color=(1.0,) * 4, size=0.1, lifetime_ns=0)
+
+
+def test_a_message_of_many_is_placed_at_once(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All who wait for transforms were looked through again for each person: a minute for a message."""
+    listener, looks = node._listener, list[int]()
+    listener.follow(load_body("male"))
+    listener.scene = Scene(node.statistics)
+    monkeypatch.setattr(node, "is_watched", lambda: True)
+    monkeypatch.setattr(node, "now_ns", lambda: 10**9)
+    monkeypatch.setattr(listener, "_place", lambda: looks.append(len(listener._waiting)))
+    listener._on_input("", "/smpl_params", keypoints(*(f"p{i}" for i in range(20))))
+    assert looks == [20]
+
+
+def test_predictions_end_with_the_messages_where_time_stands_still(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tracker that ended while a simulation was paused left its people standing there, and nothing was wrong."""
+    listener, parameters = node._listener, [Parameter("person_timeout", value=0.2)]
+    assert node.set_parameters(parameters)[0].successful
+    listener.follow(load_body("male"))
+    monkeypatch.setattr(node, "is_watched", lambda: True)
+    monkeypatch.setattr(node, "now_ns", lambda: 10**9)
+    monkeypatch.setattr(NodeListener, "is_steady", True)
+    for persons in ({"ann"}, set()):
+        listener.scene = Scene(node.statistics)
+        if persons:
+            listener._on_input("", "/smpl_params", keypoints("ann"))
+        else:
+            time.sleep(0.25)
+        listener.predict()
+        assert {*listener.scene.persons} == persons
+
+
+def test_a_clock_set_back_has_things_where_they_will_be(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    listener, now = node._listener, [8 * 10**9]
+    monkeypatch.setattr(node, "now_ns", lambda: now[0])
+    places = [Transform(s * 10**9, "map", "camera", [s, 0, 0], [0, 0, 0, 1]) for s in range(9)]
+    listener._on_transforms(deque([encode_transforms(places)]), is_static=False)
+    assert listener._tf.lookup("map", "camera", 5 * 10**9).translation[0] == 5
+    now[0] = 4 * 10**9
+    later = [Transform(4 * 10**9 + 1, "odom", "lidar", [0, 0, 0], [0, 0, 0, 1])]
+    listener._on_transforms(deque([encode_transforms(later)]), is_static=False)
+    assert listener._tf.lookup("odom", "lidar", 4 * 10**9 + 1)  # it came after the clock was set back
+    with pytest.raises(TransformError, match="older than the input"):
+        listener._tf.lookup("map", "camera", 5 * 10**9)
+
+
+def test_a_topic_of_two_types_is_said_to_be_one(ros: None) -> None:  # noqa: ARG001
+    remapped = ["--ros-args", "-r", "garments:=smpl_params"]
+    node = GarmentNode(cli_args=remapped)
+    try:
+        with pytest.raises(RefuError, match=r"can't subscribe to /smpl_params as std_msgs.*another type"):
+            node._listener.subscribe()
+    finally:
+        node.close()
+        node.destroy_node()
+
+
 def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Timers and requests waited behind all messages that had come: twenty seconds, with a crowd's keypoints."""
     executor, done, listener = make_executor(), list[bytes | str](), node._listener
@@ -149,6 +217,28 @@ def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypat
     report = node.statistics.report()
     assert (report.total["received"], report.total["drop.stale"]) == (100, 100 - INPUT_QOS.depth)
     listener.unsubscribe()
+    executor.remove_node(node)
+
+
+def test_a_crowds_topics_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of 64 people who came at once held up all else for two seconds, and again with each 64 new names."""
+    executor, there, persons = make_executor(), list[int](), [f"p{i}" for i in range(20)]
+    executor.add_node(node)
+    node.trigger_configure()
+    node._worker = SimpleNamespace(fittings=node._fittings, stop=lambda: None)
+    monkeypatch.setattr(NodeListener, "persons", persons)
+    known = node._bank._publishers
+    node._hold_topics()
+    for _ in range(3):
+        executor.create_task(lambda: there.append(len(known)))
+
+    wanted = {topic for one in node._outputs for topic in one.topics(persons, node._fittings) if topic[0] == "p"}
+    while len(there) < 3 or not wanted <= known.keys():
+        executor.spin_once(timeout_sec=0.1)
+    assert max(there) < len(known) / 2
+    monkeypatch.setattr(NodeListener, "persons", [])
+    node._hold_topics()
+    assert not wanted & known.keys()
     executor.remove_node(node)
 
 

@@ -363,6 +363,22 @@ def test_an_input_in_a_cameras_frame_is_seen_in_the_robots(
     scene.until(late_ones, "late transforms are counted")
 
 
+def test_a_camera_is_found_under_the_name_that_it_is_remapped_to(robot: Callable[..., Robot]) -> None:
+    scene = robot(garments=[TSHIRT], camera_info="camera_info", remaps=["camera_info:=/front/camera_info"])
+    scene.hear("points", PointCloud2)
+    info = scene.peer.node.create_publisher(CameraInfo, "/front/camera_info", 1)
+    calibrated = CameraInfo(width=640, height=480, k=[500.0, 0, 320, 0, 500, 240, 0, 0, 1])
+    calibrated.header.frame_id = "map"
+
+    def sees() -> bool:
+        info.publish(calibrated)
+        scene.peer.send(frame(1))
+        came = scene.heard["points"]
+        return bool(came) and "visible" in points_of(came[-1]).dtype.names
+
+    scene.until(sees, "it is said which points the camera sees", timeout=30.0)
+
+
 def test_without_transforms_the_frame_is_warned_of(
     robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -532,6 +548,8 @@ def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callab
         return not people.listeners("ann")
 
     scene.until(nobody, "nobody is tracked")
+    people.node.destroy_publisher(tracked)  # its node has died: whoever comes now is known by a topic alone
+    scene.until(lambda: people.listeners("ann"), "nobody says any more who is tracked", timeout=30.0)
     people.close()
 
 
