@@ -122,12 +122,6 @@ class _Track:
         old = max(bisect_left(self.stamps, stamp_ns - HISTORY_NS), len(self.stamps) - most)
         del self.stamps[:old], self.values[:old]
 
-    def cut(self, stamp_ns: int) -> int:
-        """Leaves out later transforms; returns how many remain."""
-        at = bisect_right(self.stamps, stamp_ns)
-        del self.stamps[at:], self.values[at:]
-        return at
-
     def at(self, stamp_ns: int, tolerance_ns: int, child: str) -> Placement:
         """The placement at that time, between the two transforms around it. Raises `TransformError`."""
         after, is_late = bisect_right(self.stamps, stamp_ns), False
@@ -216,11 +210,10 @@ class TransformBuffer:
         self._heard.add(child)
         return ""
 
-    def rewind(self, now_ns: int) -> None:
-        """Forgets what is stamped later: the clock was set back, and people of that time are yet to come."""
-        for child, track in [*self._tracks.items()]:
-            if not track.is_static and not track.cut(now_ns):
-                del self._tracks[child]
+    def rewind(self) -> None:
+        """Forgets all that moves, as tf2 does: the clock was set back, and the same stamps are of another time now."""
+        self._tracks = {name: one for name, one in self._tracks.items() if one.is_static}
+        self._since = self._clock()
 
     def lookup(self, target: str, source: str, stamp_ns: int, *, tolerance_ns: int = 0) -> Placement:
         """Where points of `source` were in `target` at that time.

@@ -259,10 +259,10 @@ class Listener:
         self._place()
 
     def _now_ns(self) -> int:
-        """ROS time [ns]; if it has gone back, where things were later is forgotten: that was another time."""
+        """ROS time [ns]; if it has gone back, transforms are forgotten. A clock that is only corrected costs none."""
         now = self._node.now_ns()
-        if now < self._latest_ns:
-            self._tf.rewind(now)
+        if now < self._latest_ns - self._settings.tolerance_ns:
+            self._tf.rewind()
         self._latest_ns = now
         return now
 

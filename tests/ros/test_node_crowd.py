@@ -176,15 +176,21 @@ def test_predictions_end_with_the_messages_where_time_stands_still(node: Any, mo
 def test_a_clock_set_back_has_things_where_they_will_be(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     listener, now = node._listener, [8 * 10**9]
     monkeypatch.setattr(node, "now_ns", lambda: now[0])
-    places = [Transform(s * 10**9, "map", "camera", [s, 0, 0], [0, 0, 0, 1]) for s in range(9)]
-    listener._on_transforms(deque([encode_transforms(places)]), is_static=False)
+
+    def come(child: str, *stamps: int) -> None:
+        ones = [Transform(stamp, "map", child, [1e-9 * stamp, 0, 0], [0, 0, 0, 1]) for stamp in stamps]
+        listener._on_transforms(deque([encode_transforms(ones)]), is_static=False)
+
+    come("camera", *range(0, 8 * 10**9 + 1, 10**9))
+    now[0] -= 10**7  # the clock is corrected
+    come("lidar", now[0])
     assert listener._tf.lookup("map", "camera", 5 * 10**9).translation[0] == 5
-    now[0] = 4 * 10**9
-    later = [Transform(4 * 10**9 + 1, "odom", "lidar", [0, 0, 0], [0, 0, 0, 1])]
-    listener._on_transforms(deque([encode_transforms(later)]), is_static=False)
-    assert listener._tf.lookup("odom", "lidar", 4 * 10**9 + 1)  # it came after the clock was set back
-    with pytest.raises(TransformError, match="older than the input"):
-        listener._tf.lookup("map", "camera", 5 * 10**9)
+    now[0] = 4 * 10**9 + 5 * 10**8  # a simulation begins anew
+    come("lidar", now[0])  # it came after that
+    come("camera", now[0] + 10**8)
+    assert listener._tf.lookup("map", "lidar", now[0])
+    with pytest.raises(TransformError, match="newer than the input"):
+        listener._tf.lookup("map", "camera", now[0])
 
 
 def test_a_topic_of_two_types_is_said_to_be_one(ros: None) -> None:  # noqa: ARG001
