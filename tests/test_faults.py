@@ -178,7 +178,10 @@ def test_weights_whose_garment_is_nowhere_near_the_body_are_refused(
 ) -> None:
     stem = copy_of(weights, tmp_path) / GARMENT / "tailornet-hybrid"
     tensors = load_tensors(stem.with_suffix(".safetensors").read_bytes())
-    full = {k: torch.full_like(v, largest) if k.endswith("weight") else v for k, v in tensors.items()}
+    full = {  # weights of that size: bytes are numbers of steps
+        k: torch.full_like(v, 1 if v.dtype == torch.int8 else largest) if k.endswith(("weight", "weight.step")) else v
+        for k, v in tensors.items()
+    }
     forge(stem, save_tensors(full))
     if largest < 1:
         load(tmp_path)
