@@ -34,7 +34,6 @@ class Bank:
         """Keeps publishers of these topics, given with their types, and no others except those that are `lasting`.
 
         Making one takes milliseconds, a crowd's seconds: returns whether it was done `until` then [s], or is to go on.
-
         Only lasting ones have QoS overrides: these are parameters, which are never removed. A type whose package is
         missing is left out and logged once. A topic whose name is too long is left out and counts as a fault.
         """

@@ -55,14 +55,11 @@ class Listener:
         """Where the frames of people go; None while nobody is dressed."""
         self.since: float | None = None
         """When the inputs were subscribed to, on the steady clock [s]; None while they aren't."""
-        self.input_frame = ""
-        """The sender's frame, where it isn't that of the messages."""
-        self._wanted_at = 0.0
+        self._wanted_at, self._latest_ns = 0.0, 0
         self._inputs: dict[str, Any] = {}
         self._frames: dict[str, str] = {}
         self._heard: dict[str, float] = {}
         """When somebody's message came last, on the steady clock [s]; of the same people as `_frames`."""
-        self._latest_ns = 0
         self._tracked: set[str] | None = None
         self._topics: list[Any] = []
         """All that there were when they could last be named: rclpy can't while a peer has one that isn't UTF-8."""
@@ -93,6 +90,13 @@ class Listener:
         settings = self._settings
         betas, smoothing = settings.known_betas, settings.keypoint_smoothing
         self.stream.follow(body, settings.keypoints, betas=betas, smoothing=smoothing)
+
+    @property
+    def input_frame(self) -> str:
+        """The frame of somebody who sends, where it isn't that of the messages."""
+        since = time.monotonic() - max(self._settings.person_timeout, _GRACE_S)
+        sent = (frame_id for name, frame_id in self._frames.items() if self._heard[name] > since)
+        return next((one for one in sent if one not in ("", self._settings.frame_id)), "")
 
     @property
     def doubted(self) -> str:
@@ -226,7 +230,8 @@ class Listener:
         for frame in () if self.stream.is_of_keypoints else frames.values():
             for doubt in self.doubts.of(person, frame, self._settings, is_y_up=self._settings.axes == "smpl"):
                 node.get_logger().warning(f"{topic}: {doubt}")
-        self.input_frame = next((one for one in given.values() if self._need_transforms(topic, one)), "")
+        for frame_id in given.values():
+            self._need_transforms(topic, frame_id)
         known = {name: frame_id for name, frame_id in self._frames.items() if name not in given}
         # A tracker's names may never come again: the oldest are forgotten.
         self._frames = dict([*known.items(), *given.items()][-self.room :])
@@ -300,18 +305,16 @@ class Listener:
         self._camera = adapters.decode_camera_info(data)
         self._need_transforms("the camera", printable(self._camera.frame_id))
 
-    def _need_transforms(self, who: str, given: str) -> bool:
-        """Subscribes to transforms once a frame isn't that of the messages; returns whether it differs."""
+    def _need_transforms(self, who: str, given: str) -> None:
+        """Subscribes to transforms once a frame isn't that of the messages."""
         target = self._settings.frame_id
-        differs = given not in ("", target)
-        if differs and self._tf_asked_at is None and not self.is_untransformed:
+        if given not in ("", target) and self._tf_asked_at is None and not self.is_untransformed:
             try:
                 self._listen_to_tf()
             except RefuError as error:
                 self.is_untransformed = True
                 text = f"{who} is in {given}, the garments are in {target}, nothing is transformed ({error})"
                 self._node.get_logger().warning(f"{text}: set frame_id to {given} if they are the same place")
-        return differs
 
     def _listen_to_tf(self) -> None:
         for topic, durability in ((_TF, DurabilityPolicy.VOLATILE), (_TF_STATIC, DurabilityPolicy.TRANSIENT_LOCAL)):

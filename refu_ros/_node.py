@@ -240,7 +240,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             known = self.settings.pipeline == self._in_use == settings.pipeline
             if reload := not known and not values.keys().isdisjoint(PIPELINE_OPTIONS):
                 settings.pipeline.check_files()
-            recorded = settings.record == self.settings.record and self.recording.running
+            recorded = settings.record == self.recording.asked and self.recording.running
             if self._state == "active" and "record" in values and not recorded:
                 self.recording.start(settings.record) if settings.record else self.recording.end()
         except RefuError as error:

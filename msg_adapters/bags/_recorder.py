@@ -249,6 +249,8 @@ class RunningRecording:
         self._recorder: Recorder | None = None
         self._closing: list[Recorder] = []
         self._error = ""
+        self.asked = ""
+        """The path that was asked for last; the bag's may be another, which was free."""
 
     @property
     def running(self) -> bool:
@@ -263,7 +265,7 @@ class RunningRecording:
         """
         recorder = Recorder(path, sync_period=self._sync_period, ended=self._ended)
         self.stop()
-        self._recorder, self._error = recorder, ""
+        self._recorder, self._error, self.asked = recorder, "", path
         self._logger.info(printable(f"recording to {recorder.path}"))
         return recorder.path
 

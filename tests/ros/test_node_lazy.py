@@ -215,6 +215,17 @@ def test_so_are_recordings(stage: Callable[..., Stage], tmp_path: Path) -> None:
             switch(True)
 
 
+def test_the_parameter_is_heeded_while_something_else_is_recorded(stage: Callable[..., Stage], tmp_path: Path) -> None:
+    """It had that value already, so it was taken and nothing was done."""
+    scene = stage(record=str(tmp_path / "a"))
+    scene.node.record(on=False)
+    scene.node.record(on=True, path=str(tmp_path / "b"))
+    for _ in range(2):  # the second time it is what is recorded
+        assert scene.node.set_parameters([Parameter("record", value=str(tmp_path / "a"))])[0].successful
+        state, _ = scene.node.recording.state()
+        assert state.path == tmp_path / "a-1"
+
+
 def test_who_needs_the_input_watched_switches_it_off(stage: Callable[..., Stage]) -> None:
     scene = stage(lazy=False)
     scene.until(lambda: scene.heard() == 1, "the node listens")

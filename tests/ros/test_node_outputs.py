@@ -400,6 +400,26 @@ def test_without_transforms_the_frame_is_warned_of(
     scene.until(warned, "as long as that lasts, the diagnostics warn of it")
 
 
+def test_one_persons_frame_is_warned_of_whoever_sends_last(
+    robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With somebody in the right frame beside them, the level was OK as often as not."""
+    monkeypatch.setitem(sys.modules, "tf2_msgs", None)
+    scene = robot("ann", "bob", persons=["ann", "bob"], garments=[TSHIRT])
+    scene.hear("garments", MarkerArray, raw=True)
+
+    def told(n: int = 0) -> bool:
+        for person, frame_id in (("ann", "camera"), ("bob", "map")):
+            scene.peer.send_raw(encoder_for("joint_state")(frame(1), frame_id=frame_id), person)
+        return len(scene.peer.diagnostics) >= n
+
+    scene.until(lambda: told() and len(scene.node._listener.scene.persons) == 2, "both are here")
+    scene.peer.forget_reports()
+    scene.until(lambda: told(5), "the node says how it is")
+    said = [one for array in scene.peer.diagnostics for one in array.status if one.name.endswith(": input")]
+    assert all("camera is taken for map" in one.message for one in said), [one.message for one in said]
+
+
 def test_a_cameras_frame_is_written_to_the_log_without_its_control_characters(
     robot: Callable[..., Robot], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
