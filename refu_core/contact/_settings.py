@@ -45,7 +45,7 @@ class ContactSettings:
     """Up to this height above its skin cloth lies on it; at twice the height it doesn't, since neighbours there lie on
     different legs, and would tear if pressed to them [m]. Half as far to its side cloth still feels a limb, less and
     less: a swinging hand moves 30 mm in a frame. Felt from 80 mm, a skirt is off by 7.0 mm and jumps by more than 20 mm
-    in 8.7 % of 343 recorded frame pairs; from 40 mm by 6.7 mm and in 9.3 %, from 20 mm by 6.6 mm and in 9.9 %. Cloth
+    in 8.7 % of 343 recorded frame pairs; from 40 mm by 6.7 mm and in 9.0 %, from 20 mm by 6.6 mm and in 9.3 %. Cloth
     near its skin feels limbs from less far: twice its height squared, divided by this. Cloth whose networks know where
     arms are (`Wearable.knows_arms`) feels limbs only within the length of one of its edges: what the networks predict
     is closer to the truth than where a limb farther off would draw the cloth."""
