@@ -221,8 +221,7 @@ class _Stored(NamedTuple):
     @classmethod
     def of(cls, components: Tensor) -> _Stored:
         """From components (R, 3 V). For components that were stored before, it gives what was stored, to the bit."""
-        rest = components[_WHOLE:]
-        fine, steps = in_steps(rest, 1) if len(rest) else (rest.to(torch.int8), rest[:, :1])
+        fine, steps = in_steps(components[_WHOLE:], 1)
         return cls(components[:_WHOLE].half().float(), fine, steps[:, 0])
 
     def components(self) -> Tensor:

@@ -76,24 +76,24 @@ def save_weights(
     """Writes `stem`.safetensors, which is returned, and its card `stem`.json; neither is ever left half written.
 
     Tensors named in `in_bytes` are stored as whole numbers of steps, with a step for each row along dimension 1. `base`
-    is the name of weights in the same folder, stored whole, that these are stored as differences from. Tensors that
-    only the base has are read as the base's. Raises `WeightsError` where a tensor isn't finite, the base can't be read,
-    or the disk can't be written.
+    is the name of weights in the same folder, stored whole, that these are stored as differences from; differences are
+    in bytes anyway. Tensors that only the base has are read as the base's. Raises `WeightsError` where a tensor isn't
+    finite, the base can't be read, or the disk can't be written.
     """
     stem = Path(stem)
     _require_sense(stem, tensors)
     differs: dict[str, Any] = {}
-    if in_bytes:
-        stored = {name: tensor for name, tensor in tensors.items() if name not in in_bytes}
-        for name in in_bytes:
-            stored[name], stored[name + _STEP] = in_steps(tensors[name].detach().cpu().float(), 1)
-        tensors = stored
     if base is not None:
         loaded = load_weights(stem.with_name(base))
         if "base" in loaded.card:
             raise WeightsError(f"{stem}: wanted a base that is stored whole, got {base}; nothing was written")
         differs = {"base": base, "base_sha256": loaded.card["sha256"]}
         tensors = _differences(tensors, loaded.tensors)
+    elif in_bytes:
+        stored = {name: tensor for name, tensor in tensors.items() if name not in in_bytes}
+        for name in in_bytes:
+            stored[name], stored[name + _STEP] = in_steps(tensors[name].detach().cpu().float(), 1)
+        tensors = stored
     data = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()})
     digest = hashlib.sha256(data).hexdigest()
     full = {"format": FORMAT, **card, **differs, "sha256": digest, "versions": versions("torch")}
@@ -164,16 +164,18 @@ def _differences(tensors: Mapping[str, Tensor], base: Mapping[str, Tensor]) -> d
 
 def _whole(stored: Weights, base: Mapping[str, Tensor]) -> Weights:
     """What is `stored` with numbers in place of bytes, and with the tensors of its base."""
+    is_difference = "base" in stored.card
     tensors = {**base, **{k: v for k, v in stored.tensors.items() if not k.endswith(_STEP)}}
     for name, step in stored.tensors.items():
         if not name.endswith(_STEP):
             continue
         name = name.removesuffix(_STEP)
         steps, start = stored.tensors.get(name, step), base.get(name)
-        is_known = start is None if "base" not in stored.card else start is not None and start.shape == steps.shape
+        is_known = is_difference == (start is not None) and (start is None or start.shape == steps.shape)
         fits = steps.dtype == torch.int8 and step.shape in ((), (*steps.shape[:1], 1, *steps.shape[2:]))
         if not (is_known and fits):
-            wanted = f"a difference from a tensor of {stored.card['base']}.safetensors" if base else "a number of steps"
+            what = "a number of steps"
+            wanted = f"a difference from a tensor of {stored.card['base']}.safetensors" if is_difference else what
             raise WeightsError(f"{stored.path}: {name[:80]} isn't {wanted}; get them again")
         tensors[name] = step * steps if start is None else start.float() + step * steps
     _require_sense(stored.path, tensors)
