@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import os
 import sys
@@ -89,11 +90,48 @@ def ints(values: Any, device: Any) -> Any:
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.int32, device=str(device))
 
 
-def recorded(kernel: Any, dim: int, inputs: Sequence[Any], device: Any) -> Any:
-    """A recorded launch, to be repeated on whatever its arrays hold by then."""
-    command = wp.launch(kernel, dim, inputs, device=str(device), record_cmd=True)
-    command.kept = inputs  # the command knows only their addresses
-    return command
+class Recorded:
+    """A recorded launch, to be repeated on whatever its arrays hold by then.
+
+    On a CPU Warp packs all arguments anew for each launch, which takes longer than many a kernel. Here they are packed
+    once, as Warp's releases from 1.15 to 1.19 do it; with any other release, Warp launches.
+    """
+
+    def __init__(self, kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: Any) -> None:
+        self._command = command = wp.launch(kernel, dim, inputs, device=str(device), record_cmd=True)
+        self.kept: Any = inputs  # the command knows only their addresses
+        self._names = [argument.label for argument in kernel.adj.args]
+        self._arguments: Any = None
+        if not command.device.is_cuda and _packs_once():
+            bounds, *values = command.params
+            kinds = [(name, type(value)) for name, value in zip(self._names, values, strict=True)]
+            self._arguments = type("Arguments", (ctypes.Structure,), {"_fields_": kinds})(*values)
+            self._addresses = ctypes.byref(bounds), ctypes.byref(self._arguments)
+
+    def launch(self) -> None:
+        """Launches it; on a GPU, on Warp's current stream."""
+        if self._arguments is None:
+            self._command.launch()
+        else:
+            self._command.hooks.forward(*self._addresses)
+
+    def argument(self, index: int) -> Any:
+        """An array among the arguments, as Warp's C code knows it; what is changed in it holds for the next launch."""
+        if self._arguments is None:
+            return self._command.params[1 + index]
+        return getattr(self._arguments, self._names[index])
+
+    def set_argument(self, index: int, value: int) -> None:
+        """Changes a number among the arguments."""
+        self._command.set_param_at_index(index, value)
+        if self._arguments is not None:
+            setattr(self._arguments, self._names[index], self._command.params[1 + index])
+
+
+def _packs_once() -> bool:
+    """Whether this is a release of Warp whose kernels on a CPU take their arguments in one C struct, by address."""
+    major, minor = map(int, wp.__version__.split(".")[:2])
+    return (1, 15) <= (major, minor) < (1, 20)
 
 
 class Repeated(threading.local):
@@ -106,7 +144,7 @@ class Repeated(threading.local):
     def __init__(self, kernel: Any, kinds: Sequence[Any], fixed: Sequence[Any] = ()) -> None:
         """The kernel takes the `fixed` arguments, then arrays of the Warp types `kinds`, outputs included."""
         self._kernel, self._kinds, self._fixed = kernel, kinds, fixed
-        self._known: dict[Any, tuple[Any, list[Any]]] = {}
+        self._known: dict[Any, tuple[Recorded, list[Any]]] = {}
 
     def __call__(self, dim: Sequence[int], *tensors: Tensor) -> None:
         """Launches with contiguous tensors of one device, which are kept alive until the next launch of these sizes.
@@ -120,15 +158,16 @@ class Repeated(threading.local):
         if key not in self._known:
             if len(self._known) >= _MOST_SIZES:
                 self._known.clear()
-            arrays = [
+            given = [
                 wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False, return_ctype=True)
                 for tensor, kind in zip(tensors, self._kinds, strict=True)
             ]
-            inputs = [*self._fixed, *arrays]
-            self._known[key] = wp.launch(self._kernel, dim, inputs, device=str(device), record_cmd=True), arrays
+            command = Recorded(self._kernel, dim, [*self._fixed, *given], device)
+            self._known[key] = command, [command.argument(len(self._fixed) + i) for i in range(len(given))]
         command, arrays = self._known[key]
+        command.kept = self._fixed, tensors
         for array, tensor in zip(arrays, tensors, strict=True):
-            array.data, array._ref = tensor.data_ptr(), tensor
+            array.data = tensor.data_ptr()
         with torch_stream(device):
             command.launch()
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from refu_core._warp import Repeated, as_warp, ints, is_plain, memory, recorded, torch_stream
+from refu_core._warp import Recorded, Repeated, as_warp, ints, is_plain, memory, torch_stream
 from refu_core.body import _aside_kernels as kernels
 from refu_core.body._collider_gradient import weights_at
 from refu_core.body._collider_kernels import Means
@@ -154,7 +154,7 @@ class Aside:
         means.mean = as_warp(places, wp.vec3)
         arguments = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means, *segments]
         arguments += [*self._corners, as_warp(self._n_near, wp.int32)]
-        return recorded(kernels.near_kernel, 1, arguments, "cpu")
+        return Recorded(kernels.near_kernel, 1, arguments, "cpu")
 
     def _is_any_inside(self, skin: Tensor) -> bool:
         """Whether any middle is inside the body. The tree is asked only if one is near the box of a segment.

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import IN_ROW, Repeated, Unpicklable, as_warp, is_plain, recorded, refit, strips, torch_stream
+from refu_core._warp import IN_ROW, Recorded, Repeated, Unpicklable, as_warp, is_plain, refit, strips, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import Anatomy, ColliderSettings
@@ -125,13 +125,13 @@ class Collider(Unpicklable):
             "touch": (steps.touch_kernel, 1 + how.deepen_rounds, [work, segments, rings, how.deepen_rounds]),
             "part": (steps.part_kernel, 2 + how.smooth_last + 2 * how.edge_rounds, part),
         }
-        commands = {"between": [recorded(kernels.between_kernel, len(PARENTS), [work, bones], self.device)]}
+        commands = {"between": [Recorded(kernels.between_kernel, len(PARENTS), [work, bones], self.device)]}
         n = len(work.skin)
         for name, (kernel, n_steps, inputs) in kernel_of.items():
             if self._is_serial:
-                commands[name] = [recorded(kernel, 1, [-1, 1, *inputs], self.device)]
+                commands[name] = [Recorded(kernel, 1, [-1, 1, *inputs], self.device)]
             else:
-                commands[name] = [recorded(kernel, n, [step, n, *inputs], self.device) for step in range(n_steps)]
+                commands[name] = [Recorded(kernel, n, [step, n, *inputs], self.device) for step in range(n_steps)]
         return commands
 
     @torch.no_grad()

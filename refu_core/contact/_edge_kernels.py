@@ -7,7 +7,7 @@ from refu_core.sdf import Skin, query_skin
 
 wp.set_module_options({"enable_backward": False})
 
-_CORNER = wp.constant(0.25)
+CORNER = wp.constant(0.25)
 """How far a corner of two planes bulges towards the middle of an edge across it, per length of the edge and per radian
 between the planes' normals: no skin between such normals bulges farther. A circle bulges by half of it."""
 
@@ -46,7 +46,7 @@ def suspect_kernel(each: int, state: State, cloth: Cloth, rules: Rules) -> None:
             if wp.where(beyond > 0.0, beyond * beyond, 0.0) < wp.dot(way, way) and first >= 0.0 and second >= 0.0:
                 is_low = first + second < rules.margin
                 if not is_low and state.face[a] >= 0 and state.face[b] >= 0:  # otherwise the bulge isn't known
-                    bulge = _CORNER * wp.length(way) * wp.length(state.gradient[a] - state.gradient[b])
+                    bulge = CORNER * wp.length(way) * wp.length(state.gradient[a] - state.gradient[b])
                     is_low = first + second < rules.margin + 2.0 * bulge
                 if is_low:
                     state.suspects[wp.atomic_add(state.counts, CUTTING, 1)] = edge

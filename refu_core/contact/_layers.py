@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core._cache import remembered
-from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
+from refu_core._warp import Recorded, as_warp, ints, memory, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
@@ -108,7 +108,7 @@ class Layer:
             "move": (kernels.move_kernel, n, [data]),
             "move all": (kernels.move_all_kernel, 1, [data, self._settings.around]),
         }
-        return {name: recorded(*launch, self.device) for name, launch in launches.items()}
+        return {name: Recorded(*launch, self.device) for name, launch in launches.items()}
 
 
 def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
+from refu_core._warp import Recorded, as_warp, ints, memory, torch_stream
 from refu_core.contact import _parting_kernels as kernels
 from refu_core.contact._settings import ContactSettings
 from refu_core.contact._sheet import Sheet, cut_of
@@ -31,14 +31,14 @@ class Parting:
         self._is_serial = rest.device.type == "cpu"
         n, n_faces = len(rest), len(cut.faces)
         self._points = memory(n, 3, device=rest.device)
-        self._marked, self._far = memory(2, n, device=rest.device)
+        self._marked = memory(n, device=rest.device)
         self._count = memory(1, dtype=torch.int32, device=rest.device)
         self._ways = memory(2, n_faces, 3, device=rest.device)
         data = kernels.Outer()
         data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
         data.order = ints(grouped_at_rest(rest.cpu().numpy()[mesh.faces].mean(axis=1)), rest.device)
         data.cut, data.count = cut, as_warp(self._count, wp.int32)
-        data.marked, data.far = as_warp(self._marked, wp.float32), as_warp(self._far, wp.float32)
+        data.marked = as_warp(self._marked, wp.float32)
         data.pulled = wp.zeros(n, dtype=wp.int32, device=str(rest.device))
         bounds = [settings.tolerance, settings.gap]
         each = int(BLOCK) if self._is_serial else 1
@@ -47,18 +47,10 @@ class Parting:
             "measure": (kernels.measure_kernel, n_faces, [sheet.data, data, *bounds]),
             "part": (kernels.part_kernel, n, [data]),
         }
-        self._commands = {name: recorded(*launch, rest.device) for name, launch in launches.items()}
+        self._commands = {name: Recorded(*launch, rest.device) for name, launch in launches.items()}
 
-    def find(self, above: Tensor, far: Tensor | None = None) -> Tensor:
-        """How many pairs of faces of the outer garment, (V, 3) [m], and of the sheet cut each other, int32, (1,).
-
-        `far` (V,) says how far from the sheet each vertex is at least [m], if that is known: faces too far off to cut
-        it are skipped.
-        """
-        if far is None:
-            self._far.zero_()
-        else:
-            self._far.copy_(far)
+    def find(self, above: Tensor) -> Tensor:
+        """How many pairs of faces of the outer garment, (V, 3) [m], and of the sheet cut each other, int32, (1,)."""
         self._sheet.fit()
         with torch_stream(self._device):
             self._marked.zero_()
@@ -84,18 +76,15 @@ class Parting:
                 self._commands["part"].launch()
         return self._points.clone()
 
-    def parted(self, above: Tensor, distance: Tensor) -> Tensor:
+    def parted(self, above: Tensor) -> Tensor:
         """The outer garment, (V, 3) [m], moved off the sheet if at most half the cuts are left; else as it was.
 
-        Where nothing cuts, a CPU returns the very same tensor.
-
-        `distance` (V,) is how far from the sheet its vertices are at least [m]. An approximate one may be too long and
-        hide cuts. So it only says where to look for a first one; if there is one, all are looked for. Where a hand is
-        deep in a hip, the way out of one leads into the other, and nothing is done. On recorded motion no cut is left.
-        With limbs through the trunk about as many are left, so rounding would decide if one cut fewer were enough.
+        Where nothing cuts, a CPU returns the very same tensor. Where a hand is deep in a hip, the way out of one leads
+        into the other, and nothing is done. On recorded motion no cut is left. With limbs through the trunk about as
+        many are left, so rounding would decide if one cut fewer were enough.
         """
-        n_seen = self.find(above, distance)
-        if self._is_serial and not int(n_seen):
+        n_before = self.find(above)
+        if self._is_serial and not int(n_before):
             return above
-        n_before, parted = self.find(above), self.part(above)
-        return torch.where((n_seen > 0) & (2 * self.find(parted) <= n_before), parted, above)
+        parted = self.part(above)
+        return torch.where((n_before > 0) & (2 * self.find(parted) <= n_before), parted, above)

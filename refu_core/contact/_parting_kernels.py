@@ -2,10 +2,15 @@
 
 import warp as wp
 
+from refu_core.contact._edge_kernels import CORNER
 from refu_core.contact._layers_kernels import Below, Cut
+from refu_core.sdf import Skin, query_skin
 from refu_core.sdf._crossing_kernels import Corners, double, meeting_edges
 
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})
+
+MOST_LEVELS = wp.constant(4)
+"""How often a face is quartered: its parts are about a millimetre wide then."""
 
 
 @wp.struct
@@ -17,8 +22,6 @@ class Outer:
     cut: Cut
     order: wp.array[int]
     """Its faces, sorted so that those of each `BLOCK` are near each other."""
-    far: wp.array[float]
-    """How far from the sheet each vertex is at least [m]; 0 where that isn't known."""
     marked: wp.array[float]
     """1 for corners of faces that cut the sheet; later, for vertices that were moved last."""
     pulled: wp.array[int]
@@ -66,15 +69,86 @@ def cut_each_other(face: int, own: wp.mat33, other: wp.mat33, faces: wp.array2d[
 
 
 @wp.func
-def may_cut(face: int, own: wp.mat33, outer: Outer) -> bool:
-    """Whether a face is near enough to the sheet to cut it.
+def may_bulge(corner: wp.mat33, far: wp.vec3, normal: wp.mat33) -> bool:
+    """Whether skin may bulge up to a triangle between its corners, by how `far` they are off and the normals below."""
+    spread = wp.max(wp.length_sq(normal[0] - normal[1]), wp.length_sq(normal[1] - normal[2]))
+    spread = wp.max(spread, wp.length_sq(normal[2] - normal[0]))
+    longest = wp.max(wp.length_sq(corner[0] - corner[1]), wp.length_sq(corner[1] - corner[2]))
+    longest = wp.max(longest, wp.length_sq(corner[2] - corner[0]))
+    lowest = wp.min(wp.min(far[0], far[1]), far[2])
+    return lowest <= 0.0 or lowest * lowest <= CORNER * CORNER * longest * spread
 
-    No place on a triangle is farther from the nearest corner than the longest edge, divided by the root of three.
-    """
-    faces = outer.cut.faces
-    far = wp.min(wp.min(outer.far[faces[face, 0]], outer.far[faces[face, 1]]), outer.far[faces[face, 2]])
-    longest = wp.max(wp.length_sq(own[0] - own[1]), wp.length_sq(own[1] - own[2]))
-    return far <= 0.0 or 3.0 * far * far <= wp.max(longest, wp.length_sq(own[2] - own[0]))
+
+@wp.func
+def quarter(triangle: wp.mat33, number: int, level: int) -> wp.mat33:
+    """Triangle `number` of the 4^level that a triangle is cut into, at the middles of its edges again and again."""
+    part = triangle
+    for i in range(level):
+        k = (number >> (2 * (level - 1 - i))) & 3
+        middles = 0.5 * wp.matrix_from_rows(part[0] + part[1], part[1] + part[2], part[2] + part[0])
+        if k == 3:
+            part = middles
+        else:
+            part = wp.matrix_from_rows(
+                wp.where(k == 0, part[0], middles[wp.where(k == 1, 0, 2)]),
+                wp.where(k == 1, part[1], middles[wp.where(k == 0, 0, 1)]),
+                wp.where(k == 2, part[2], middles[wp.where(k == 0, 2, 1)]),
+            )
+    return part
+
+
+@wp.func
+def is_cut(own: wp.mat33, near: int, skin: Skin) -> bool:
+    """Whether a place on a face is inside the body, or at least may be: asks wherever skin may bulge up to the face."""
+    number = int(0)
+    level = int(1)
+    while level > 0:
+        part = quarter(own, number, level)
+        far = wp.vec3()
+        normal = Corners()
+        for k in range(3):
+            distance, gradient, _face = query_skin(skin, part[k], near)
+            far[k] = distance
+            normal[k] = gradient
+        if wp.min(wp.min(far[0], far[1]), far[2]) < 0.0:
+            return True
+        if may_bulge(part, far, wp.matrix_from_rows(normal[0], normal[1], normal[2])):
+            if level == MOST_LEVELS:
+                return True
+            level += 1
+            number *= 4
+        else:
+            number += 1
+            while level > 0 and number % 4 == 0:
+                level -= 1
+                number = wp.where(level > 0, number // 4, 1)
+    return False
+
+
+@wp.kernel
+def glimpse_kernel(
+    each: int,
+    faces: wp.array2d[int],
+    skin: Skin,
+    points: wp.array[wp.vec3],
+    distance: wp.array[float],
+    gradient: wp.array[wp.vec3],
+    closest: wp.array[int],
+    # outputs
+    count: wp.array[int],
+) -> None:
+    """Counts faces that cut the skin, or of which a corner's distance is 0, so unknown; `each` faces a thread."""
+    first = each * wp.tid()
+    for face in range(first, wp.min(first + each, faces.shape[0])):
+        i = faces[face, 0]
+        j = faces[face, 1]
+        k = faces[face, 2]
+        own = corners(face, points, faces)
+        far = wp.vec3(distance[i], distance[j], distance[k])
+        if may_bulge(own, far, wp.matrix_from_rows(gradient[i], gradient[j], gradient[k])):
+            is_known = distance[i] != 0.0 and distance[j] != 0.0 and distance[k] != 0.0
+            if not is_known or is_cut(own, closest[i], skin):
+                wp.atomic_add(count, 0, 1)
 
 
 @wp.kernel
@@ -88,12 +162,10 @@ def find_kernel(each: int, below: Below, outer: Outer) -> None:
     highs = Corners()
     for n in range(first, end):
         own = corners(outer.order[n], outer.points, outer.cut.faces)
-        lows[n - first] = wp.vec3(wp.inf)
-        if may_cut(outer.order[n], own, outer):
-            lows[n - first] = lowest(own)
-            highs[n - first] = highest(own)
-            lower = wp.min(lower, lowest(own))
-            upper = wp.max(upper, highest(own))
+        lows[n - first] = lowest(own)
+        highs[n - first] = highest(own)
+        lower = wp.min(lower, lowest(own))
+        upper = wp.max(upper, highest(own))
     lower = wp.max(lower, below.extent[0])
     upper = wp.min(upper, below.extent[1])
     if lower[0] > upper[0] or lower[1] > upper[1] or lower[2] > upper[2]:

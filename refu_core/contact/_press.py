@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, memory, recorded, refit, torch_stream
+from refu_core._warp import Recorded, as_warp, ints, memory, refit, torch_stream
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._bundle_kernels import bound_kernel, enclose_kernel
 from refu_core.body._bundles import bundled
@@ -38,8 +38,8 @@ class LimbMeshes:
         self.bundles = bundled(body.v_template.cpu().numpy(), of_limbs, body.device)
         """Boxes around their faces that are close together."""
         self._fit = [
-            recorded(bound_kernel, len(self.bundles.low), [points, self.bundles], self._device),
-            recorded(enclose_kernel, len(self.meshes), [self.bundles], self._device),
+            Recorded(bound_kernel, len(self.bundles.low), [points, self.bundles], self._device),
+            Recorded(enclose_kernel, len(self.meshes), [self.bundles], self._device),
         ]
 
     def update(self, body: Tensor) -> None:
@@ -117,7 +117,7 @@ class Press:
         for sweep in range(sweeps):
             fields = [fabric.cut, fabric.spread] if sweep % 2 == 0 else [fabric.spread, fabric.cut]
             launches[f"spread {sweep}"] = kernels.spread_kernel, n, [fabric, 0.0 if sweep < near else 1.0, *fields]
-        return {name: recorded(*launch, self.device) for name, launch in launches.items()}
+        return {name: Recorded(*launch, self.device) for name, launch in launches.items()}
 
     @torch.no_grad()
     def __call__(self, points: Tensor, skin: Tensor) -> Tensor:

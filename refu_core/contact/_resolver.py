@@ -11,8 +11,8 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Unpicklable, as_warp, ints, memory, recorded, torch_stream
-from refu_core.contact import _edge_kernels, _resolver_kernels, _round_kernels, _state
+from refu_core._warp import Recorded, Repeated, Unpicklable, as_warp, ints, memory, torch_stream
+from refu_core.contact import _edge_kernels, _parting_kernels, _resolver_kernels, _round_kernels, _state
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity
@@ -28,6 +28,10 @@ class Resolution(NamedTuple):
     """Garment vertices [m], shape (N, 3)."""
     distance: Tensor
     """Their signed distance [m], shape (N,); beyond the margin it may be a lower bound."""
+    gradient: Tensor
+    """Its unit gradient there, shape (N, 3)."""
+    face: Tensor
+    """The body's closest face, int32, shape (N,); -1 where none is known."""
     numbers: Tensor
     """`n_inside`, `n_pushed`, `n_unresolved` and `max_depth`, shape (4,), on the garment's device."""
 
@@ -78,6 +82,7 @@ class Resolver(Unpicklable):
         mesh = Connectivity.of(faces, n)
         self._n_edges = e = len(mesh.edges)
         self._cloth = _cloth(mesh, self.device)
+        self._faces, self._glimpsed = ints(mesh.faces, self.device), None
         self._state = state = _state.State()
         self._vectors = {name: memory(n, 3, device=self.device) for name in _VECTORS}
         self._floats = {name: memory(n, device=self.device) for name in _FLOATS}
@@ -164,7 +169,29 @@ class Resolver(Unpicklable):
         depth = -self._floats["first"].amin(0, keepdim=True)
         counts = self._counts[_state.INSIDE : _state.STUCK + 1].float()
         numbers = torch.cat((counts, depth.clamp_min(0)))
-        return Resolution(self._vectors["place"].clone(), self._floats["distance"].clone(), numbers)
+        found = self._vectors["place"], self._floats["distance"], self._vectors["gradient"], self._ints["face"]
+        vertices, distance, gradient, face = (one.clone() for one in found)
+        return Resolution(vertices, distance, gradient, face, numbers)
+
+    @torch.no_grad()
+    def glimpse(self, result: Resolution, points: Tensor, sdf: MeshSdf) -> Tensor:
+        """How many faces with vertices `points` (N, 3) [m] are seen to cut the body last given to `sdf`, int32, (1,).
+
+        The body is asked only where it may bulge up to a face, by what is known of the face's corners: `result`, for
+        vertices that are still there. Faces with a corner that has moved count as well. That takes a fifth of the time
+        of `Parting.find`, and sees whether any face cuts smooth skin, however fine. The tip of a finger may be missed.
+        """
+        skin = sdf.skin()
+        if self._glimpsed is not skin:
+            self._glimpsed, n = skin, len(self._faces)
+            self._n_threads, each = (1, n) if self._is_serial else (n, 1)
+            kinds = (wp.vec3, wp.float32, wp.vec3, wp.int32, wp.int32)
+            self._glimpse = Repeated(_parting_kernels.glimpse_kernel, kinds, [each, self._faces, skin])
+        count = torch.zeros(1, dtype=torch.int32, device=self.device)
+        has_moved = (points - result.vertices).norm(dim=1) > self._settings.tolerance
+        far = torch.where(has_moved, 0.0, result.distance)
+        self._glimpse((self._n_threads,), points.contiguous(), far, result.gradient, result.face, count)
+        return count
 
     def _reconcile(self) -> None:
         """Finds closest faces that were missed, where distances along an edge contradict each other."""
@@ -231,7 +258,7 @@ class Resolver(Unpicklable):
     def _run(self, name: str, parameter: tuple[int, int] | None = None) -> None:
         """Launches a step; `parameter` is the position and new value of one of its parameters."""
         if parameter is not None:
-            self._commands[name].set_param_at_index(*parameter)
+            self._commands[name].set_argument(*parameter)
         self._commands[name].launch()
 
     def _launches(self, skin: Any, margin: float) -> dict[str, Any]:
@@ -265,7 +292,7 @@ class Resolver(Unpicklable):
             numbers = [how.near, how.around, long_step, short_step]
             steps["blend"] = (_resolver_kernels.blend_kernel, [state, cloth, *numbers])
             steps["raise edges"] = (_edge_kernels.raise_edges_kernel, [state, cloth, skin, rules])
-            return {name: recorded(kernel, 1, inputs, self.device) for name, (kernel, inputs) in steps.items()}
+            return {name: Recorded(kernel, 1, inputs, self.device) for name, (kernel, inputs) in steps.items()}
         steps["reach"] = (_round_kernels.reach_kernel, [state, cloth])
         steps["spread0"] = (_round_kernels.spread_kernel, [state, cloth, long_step, state.field, state.smoother])
         steps["spread1"] = (_round_kernels.spread_kernel, [state, cloth, short_step, state.smoother, state.field])
@@ -282,10 +309,10 @@ class Resolver(Unpicklable):
         for name, source in (("choose0", low), ("choose1", lower)):
             of_edges[name] = _round_kernels.choose_kernel, [state, cloth, 0, source]
         return {
-            "close": recorded(_round_kernels.close_kernel, 1, [state, 0], self.device),
-            **{name: recorded(kernel, n, inputs, self.device) for name, (kernel, inputs) in steps.items()},
+            "close": Recorded(_round_kernels.close_kernel, 1, [state, 0], self.device),
+            **{name: Recorded(kernel, n, inputs, self.device) for name, (kernel, inputs) in steps.items()},
             **{
-                name: recorded(kernel, self._n_edges, inputs, self.device)
+                name: Recorded(kernel, self._n_edges, inputs, self.device)
                 for name, (kernel, inputs) in of_edges.items()
             },
         }

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, ints, memory, recorded, torch_stream
+from refu_core._warp import Recorded, as_warp, ints, memory, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.mesh import Connectivity
 
@@ -34,7 +34,7 @@ class Sheet:
         data.tree = self._tree.id
         self._has_late_tree = self._has_late_normals = True
         arrays = [data.points, data.cut, data.normals]
-        self._normals_of = recorded(kernels.normals_kernel, len(self.vertices), arrays, rest.device)
+        self._normals_of = Recorded(kernels.normals_kernel, len(self.vertices), arrays, rest.device)
 
     def take(self, vertices: Tensor) -> None:
         """Takes over a pose, (U, 3) [m]."""

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, memory, recorded, torch_stream
+from refu_core._warp import Recorded, as_warp, memory, torch_stream
 from refu_core.contact import _strain_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import cut_of
@@ -37,9 +37,9 @@ class StrainLimit:
         )
         net.limit, net.count = settings.strain_limit, as_warp(self._count, wp.int32)
         net.rows, net.is_listed = (wp.zeros(n, dtype=wp.int32, device=str(device)) for _ in range(2))
-        self._limit = recorded(kernels.limit_kernel, 1, [net, settings.sweeps], device)
+        self._limit = Recorded(kernels.limit_kernel, 1, [net, settings.sweeps], device)
         self._sweeps = [
-            recorded(kernels.sweep_kernel, n, [net, *places], device)
+            Recorded(kernels.sweep_kernel, n, [net, *places], device)
             for places in ((net.points, net.other), (net.other, net.points))
         ]
 

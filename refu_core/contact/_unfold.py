@@ -11,7 +11,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import as_warp, memory, recorded, torch_stream
+from refu_core._warp import Recorded, as_warp, memory, torch_stream
 from refu_core.body import PARENTS, JointWeights
 from refu_core.contact import _layers_kernels as layers
 from refu_core.contact import _unfold_kernels as kernels
@@ -69,7 +69,7 @@ class Unfold:
             "bound": (kernels.bound_kernel, n, [fold, farthest]),
             "unfold all": (kernels.unfold_all_kernel, 1, [fold, fade, settings.around, rounds, farthest]),
         }
-        self._commands = {name: recorded(*launch, device) for name, launch in launches.items()}
+        self._commands = {name: Recorded(*launch, device) for name, launch in launches.items()}
 
     @torch.no_grad()
     def __call__(self, points: Tensor, rotation: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, memory, recorded, torch_stream
+from refu_core._warp import Recorded, as_warp, memory, torch_stream
 from refu_core.contact import _way_out_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import Sheet
@@ -32,7 +32,7 @@ class WayOut:
         n_places = len(skin.vertices) + len(skin.mesh.faces)
         self._above = memory(n_places, 3, device=self.device)
         inputs = [settings.tolerance, skin.data.points, skin.data.cut, as_warp(self._above, wp.vec3)]
-        self._lift = recorded(kernels.above_kernel, n_places, inputs, self.device)
+        self._lift = Recorded(kernels.above_kernel, n_places, inputs, self.device)
 
     def update(self) -> None:
         """Takes over the pose that the skin has taken."""

@@ -201,13 +201,13 @@ class ContactStage:
             vertices = self._within_reach(vertices, pressed)
         vertices = self._taken_out(vertices, pressed, margin, numbers)
         if self._has_room:
-            distance = done.distance
-            if vertices is not done.vertices:  # where they were taken out, the approximate distance had missed a limb
-                has_moved = (vertices - done.vertices).norm(dim=1) > self._settings.tolerance
-                distance = torch.where(has_moved, 0.0, distance)
-            parted = self._off_skin[name].parted(vertices, distance)
-            if parted is not vertices:
-                vertices = self._taken_out(self._within_reach(parted, pressed), pressed, margin, numbers)
+            n_seen = resolver.glimpse(done, vertices, self.sdf)
+            if not self._is_serial or int(n_seen):
+                parted = self._off_skin[name].parted(vertices)
+                if not self._is_serial:
+                    parted = torch.where(n_seen > 0, parted, vertices)
+                if parted is not vertices:
+                    vertices = self._taken_out(self._within_reach(parted, pressed), pressed, margin, numbers)
         return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
 
     def _taken_out(self, vertices: Tensor, pressed: Tensor, margin: float, numbers: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, memory, recorded
+from refu_core._warp import Recorded, Repeated, as_warp, memory
 from refu_core.body import SmplBody
 from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate
@@ -230,7 +230,7 @@ class Scan:
         cells.points = wp.empty(n, dtype=wp.vec3, device="cpu")
         cells.squared = wp.empty(n, dtype=wp.float32, device="cpu")
         self._sort = Repeated(sort_kernel, (wp.vec3, wp.int32), [cells])
-        self._scan = recorded(scan_kernel, self._n_faces, [self._body, cells], "cpu")
+        self._scan = Recorded(scan_kernel, self._n_faces, [self._body, cells], "cpu")
         self._finish = Repeated(finish_kernel, (wp.vec3, wp.float32, *FOUND), [self._body, cells])
 
 

@@ -224,9 +224,10 @@ def require_finite(name: str, values: Tensor) -> None:
     """Raises `MeshError` where `values`, shape (N, 3) [m], aren't all finite, or are so large that squares overflow."""
     if values.is_cuda and torch.cuda.is_current_stream_capturing():
         return  # a CUDA graph can't wait for the answer; what it replays was checked where it came in
-    if not len(values):
+    flat = values.detach().reshape(-1)
+    if float(torch.dot(flat, flat)) <= _FARTHEST**2:  # no square is larger than their sum, which is quick to know
         return
-    largest = float(values.detach().abs().max())  # NaN if any value is; as quick as a sum
+    largest = float(flat.abs().max())  # NaN if any value is
     if not math.isfinite(largest):
         bad = int((~torch.isfinite(values)).any(dim=-1).sum())
         raise MeshError(f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates")

@@ -9,6 +9,7 @@ right: `CudaCapture` needs a GPU.
 from __future__ import annotations
 
 import copy
+import ctypes
 import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -26,6 +27,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
 from refu_core import GarmentPipeline, SmplFrame
+from refu_core._warp import Recorded
 from refu_core.backbones import WithBeyond
 from refu_core.errors import MeshError
 from refu_core.realtime import GarmentStats, SkinShift, Wearer
@@ -78,16 +80,17 @@ def _again(func: Any, args: Any, kwargs: Any, made: list[Tensor]) -> None:
 @contextmanager
 def recording(done: list[Callable[[], object]]) -> Iterator[None]:
     """Adds what torch and Warp are asked for to `done`, with the arguments that they have then."""
-    launch, launch_again, refit = wp.launch, wp.Launch.launch, wp.Mesh.refit
+    launch, launch_again, refit = wp.launch, Recorded.launch, wp.Mesh.refit
 
     def launched(*args: Any, **kwargs: Any) -> Any:
         if not kwargs.get("record_cmd"):
             done.append(partial(launch, *args, **kwargs))
         return launch(*args, **kwargs)
 
-    def launched_again(command: Any) -> None:
+    def launched_again(command: Recorded) -> None:
         now = copy.copy(command)
-        now.params = [copy.copy(one) for one in command.params]
+        now._arguments = type(now._arguments).from_buffer_copy(now._arguments)
+        now._addresses = now._addresses[0], ctypes.byref(now._arguments)
         done.append(partial(launch_again, now))
         launch_again(command)
 
@@ -97,7 +100,7 @@ def recording(done: list[Callable[[], object]]) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch, _Recorder(done):
         patch.setattr(wp, "launch", launched)
-        patch.setattr(wp.Launch, "launch", launched_again)
+        patch.setattr(Recorded, "launch", launched_again)
         patch.setattr(wp.Mesh, "refit", refitted)
         patch.setattr(_mesh, "require_finite", lambda *_: None)  # which a graph can't do, and doesn't
         yield

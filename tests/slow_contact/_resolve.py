@@ -90,7 +90,8 @@ def resolve(
             (distance < 0).sum(),
         ]
     )
-    return Resolution(vertices, distance, torch.cat((numbers.to(depth), depth)))
+    face = torch.full((len(points),), -1, dtype=torch.int32) if state.near is None else state.near
+    return Resolution(vertices, distance, state.gradient, face, torch.cat((numbers.to(depth), depth)))
 
 
 @dataclass(eq=False)
