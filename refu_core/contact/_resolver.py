@@ -188,8 +188,10 @@ class Resolver(Unpicklable):
             kinds = (wp.vec3, wp.float32, wp.vec3, wp.int32, wp.int32)
             self._glimpse = Repeated(_parting_kernels.glimpse_kernel, kinds, [each, self._faces, skin])
         count = torch.zeros(1, dtype=torch.int32, device=self.device)
-        has_moved = (points - result.vertices).norm(dim=1) > self._settings.tolerance
-        far = torch.where(has_moved, 0.0, result.distance)
+        far = result.distance
+        if points is not result.vertices:
+            has_moved = (points - result.vertices).norm(dim=1) > self._settings.tolerance
+            far = torch.where(has_moved, 0.0, far)
         self._glimpse((self._n_threads,), points.contiguous(), far, result.gradient, result.face, count)
         return count
 

@@ -204,6 +204,23 @@ def test_stacked_perceptrons_are_perceptrons() -> None:
     torch.testing.assert_close(stack(x, mixture), wanted, atol=1e-5, rtol=1e-4)
 
 
+def test_perceptrons_without_a_share_of_the_mixture_are_left_out() -> None:
+    """Of one mixture for several calls; what is changed in it, or in the weights, is heeded."""
+    stack, x = StackedPerceptrons(4, 5, (8, 8), 6, activation="silu").eval(), torch.randn(3, 5)
+    mixture = torch.tensor([[0.7, 0.0, 0.3, 1e-6], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 1e-6]])
+    for change in (lambda: None, lambda: mixture[0, 1].fill_(0.2), lambda: stack.weights[1].mul_(2.0)):
+        with torch.no_grad():
+            change()
+            found = stack(x, mixture)
+        torch.testing.assert_close(found, stack(x, mixture), atol=1e-5, rtol=0)
+        assert len(stack._counting(mixture)[0][0]) == 4, "where derivatives are wanted"
+    with torch.no_grad():
+        stack.weights[0][1] = torch.nan
+        assert not stack(x, mixture).isfinite().all()
+        mixture[0, 1] = 0.0
+        assert stack(x, mixture).isfinite().all(), "it wasn't computed"
+
+
 def test_papers_preset_has_its_sizes_and_takes_a_step() -> None:
     garment = load_garment(GARMENT)
     config = backbone_config("tailornet", garment, preset="paper")

@@ -22,13 +22,14 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core._warp import Recorded
 from refu_core.backbones import WithBeyond
+from refu_core.backbones._perceptron import StackedPerceptrons
 from refu_core.errors import MeshError
 from refu_core.realtime import GarmentStats, SkinShift, Wearer
 from refu_core.realtime._frame import FrameStep, packed_by
@@ -125,8 +126,9 @@ def as_on_a_gpu(pipeline: GarmentPipeline) -> FrameStep:
     """The pipeline's step, with the launches that a GPU gets, and a tree that isn't built anew."""
     contact, collider = pipeline._steps[0].contact, pipeline.outfit.collider
     for one in pipeline.outfit.wearables.values():
-        if isinstance(one.backbone, WithBeyond):
-            one.backbone._is_serial = False
+        for module in one.backbone.modules() if isinstance(one.backbone, nn.Module) else ():
+            if isinstance(module, (WithBeyond, StackedPerceptrons)):
+                module._is_serial = False
     if collider is not None:
         collider._is_serial = collider.anatomy.aside._is_serial = False
     if contact is not None:
