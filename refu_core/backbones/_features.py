@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+import warp as wp
 from torch import Tensor, nn
 
+from refu_core._warp import Repeated, is_plain
+from refu_core.backbones._feature_kernels import features_kernel
 from refu_core.body import rotvec_to_rotmat, up_in
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_STYLES
@@ -96,9 +99,11 @@ class PoseFeatures(nn.Module):
         keep = torch.zeros(24, 1)
         keep[list(joints)] = 1.0
         self.register_buffer("_index", torch.tensor((0, *self.joints)), persistent=False)
+        self.register_buffer("_joint", self._index.int(), persistent=False)
         self.register_buffer("_keep", keep, persistent=False)
         self.register_buffer("_eye", torch.from_numpy(np.eye(3, dtype=np.float32)), persistent=False)
         self._index: Tensor
+        self._joint: Tensor
         self._keep: Tensor
         self._eye: Tensor
 
@@ -126,8 +131,15 @@ class PoseFeatures(nn.Module):
         if self.encoding == "rotvec":
             whole = torch.cat((tilt_rotvec(told_up(up_in_root(pose)))[:, None], pose[:, 1:]), 1)
             return (whole * self._keep).flatten(1)
+        if is_plain(pose):
+            features = pose.new_empty(len(pose), self.size)
+            _see((len(pose), len(self._joint)), self._joint, pose.contiguous(), features)
+            return features
         rotations = rotvec_to_rotmat(pose[:, self._index])  # the root's first
         return torch.cat((told_up(up_in(rotations[:, 0])), (rotations[:, 1:] - self._eye).flatten(1)), 1)
+
+
+_see = Repeated(features_kernel, (wp.int32, wp.vec3, wp.float32), [MOST_TILT])
 
 
 def style_shape(betas: Tensor, style: Tensor | None) -> Tensor:

@@ -23,6 +23,8 @@ from refu_core.body._parts import SEGMENTS as SEGMENTS
 from refu_core.body._parts import joints_of as joints_of
 from refu_core.body._parts import part_of_faces as part_of_faces
 from refu_core.body._parts import weight_of_parts as weight_of_parts
+from refu_core.body._pose_kernels import rodrigues as rodrigues
+from refu_core.body._pose_kernels import up_seen as up_seen
 from refu_core.body._register import Registration as Registration
 from refu_core.body._rest_pose import require_rest_pose as require_rest_pose
 from refu_core.body._skinning import JointWeights as JointWeights

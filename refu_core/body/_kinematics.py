@@ -10,7 +10,7 @@ import warp as wp
 from torch import Tensor
 
 from refu_core._warp import Repeated, is_plain
-from refu_core.body._pose_kernels import chain_kernel, rotation_kernel
+from refu_core.body._pose_kernels import UP_STEP, chain_kernel, rotation_kernel
 from refu_core.errors import FrameError
 from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
 from refu_core.skeleton import PARENTS as PARENTS
@@ -51,12 +51,10 @@ def up_in(rotation: Tensor) -> Tensor:
     turns round would be told from somebody who doesn't, by how the heading is rounded. Where limbs run through each
     other, cloth that differs by as little may be pressed out another way.
     """
-    up, step = rotation[:, 1], _GRID * torch.finfo(rotation.dtype).eps
+    up, eps = rotation[:, 1], torch.finfo(rotation.dtype).eps
+    step = UP_STEP * eps / torch.finfo(torch.float32).eps
     rounded = (up / step).round() * step
     return up + (rounded - up).detach() if up.requires_grad else rounded
-
-
-_GRID = 512
 
 
 class RigidTransforms(NamedTuple):

@@ -9,11 +9,9 @@ from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
-def rotation_kernel(rotvec: wp.array[wp.vec3], rotation: wp.array[wp.mat33]) -> None:
-    """Rodrigues' formula, with the same series near zero as `rotvec_to_rotmat`."""
-    i = wp.tid()
-    r = rotvec[i]
+@wp.func
+def rodrigues(r: wp.vec3) -> wp.mat33:
+    """The rotation matrix of a rotation vector, with the same series near zero as `rotvec_to_rotmat`."""
     angle2 = wp.dot(r, r)
     a = float(1.0) - angle2 / 6.0 + angle2 * angle2 / 120.0
     b = float(0.5) - angle2 / 24.0 + angle2 * angle2 / 720.0
@@ -22,8 +20,29 @@ def rotation_kernel(rotvec: wp.array[wp.vec3], rotation: wp.array[wp.mat33]) -> 
         half = wp.sin(0.5 * angle)
         a = wp.sin(angle) / angle
         b = 2.0 * half * half / angle2
-    one = wp.identity(n=3, dtype=float)
-    rotation[i] = one + a * wp.skew(r) + b * (wp.outer(r, r) - angle2 * one)
+    sine = a * r
+    return wp.matrix_from_rows(
+        wp.vec3(1.0 + b * (r[0] * r[0] - angle2), b * r[0] * r[1] - sine[2], b * r[0] * r[2] + sine[1]),
+        wp.vec3(b * r[1] * r[0] + sine[2], 1.0 + b * (r[1] * r[1] - angle2), b * r[1] * r[2] - sine[0]),
+        wp.vec3(b * r[2] * r[0] - sine[1], b * r[2] * r[1] + sine[0], 1.0 + b * (r[2] * r[2] - angle2)),
+    )
+
+
+@wp.func
+def up_seen(root: wp.vec3) -> wp.vec3:
+    """World up in the axes of a root with this rotation vector, on the grid of `up_in`."""
+    up = rodrigues(root)[1] / UP_STEP
+    return UP_STEP * wp.vec3(wp.rint(up[0]), wp.rint(up[1]), wp.rint(up[2]))
+
+
+UP_STEP = wp.constant(2.0**-14)
+
+
+@wp.kernel
+def rotation_kernel(rotvec: wp.array[wp.vec3], rotation: wp.array[wp.mat33]) -> None:
+    """`rodrigues` for each vector."""
+    i = wp.tid()
+    rotation[i] = rodrigues(rotvec[i])
 
 
 @wp.kernel

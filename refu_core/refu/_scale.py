@@ -9,11 +9,14 @@ from itertools import pairwise
 from typing import Literal
 
 import torch
+import warp as wp
 from torch import Tensor, nn
 from torch.nn import functional
 
+from refu_core._warp import Repeated, is_plain
 from refu_core.body import rotvec_to_rotmat, up_in
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
+from refu_core.refu._scale_kernels import scale_inputs_kernel
 
 ScaleKind = Literal["vertex", "shared", "distance"]
 VertexScale = Callable[[Tensor, Tensor], Tensor]
@@ -143,12 +146,19 @@ def scale_inputs(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
     The root's rotation enters as the direction of gravity, which is all of it that a garment can feel. The other
     rotation vectors enter with angles up to π: callers may pass larger ones.
     """
+    gamma = betas.new_zeros(len(betas), N_STYLES) if style is None else style
+    if is_plain(betas, pose, gamma):
+        inputs = pose.new_empty(len(pose), N_INPUTS)
+        _read((len(pose),), *(one.contiguous() for one in (pose, betas, gamma)), inputs)
+        return inputs
     angle = torch.linalg.vector_norm(pose, dim=-1, keepdim=True)
     wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
     joints = pose * (wrapped / angle.clamp_min(1e-6))
     up = up_in(rotvec_to_rotmat(joints[:, 0]))
-    gamma = betas.new_zeros(len(betas), 4) if style is None else style
     return torch.cat((betas, joints[:, 1:].flatten(1), up, gamma), dim=1)
+
+
+_read = Repeated(scale_inputs_kernel, (wp.vec3, wp.float32, wp.float32, wp.float32))
 
 
 class _DenseLatent(nn.Module):

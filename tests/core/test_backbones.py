@@ -194,6 +194,18 @@ def test_a_batch_is_its_rows(garment: GarmentTemplate, basis: BasisDecoder) -> N
     torch.testing.assert_close(whole, torch.stack(rows), atol=1e-6, rtol=0)
 
 
+@given(seed=seeds, size=st.sampled_from([0.3, 1.0, 3.0]))
+def test_features_are_the_same_where_derivatives_are_wanted(seed: int, size: float) -> None:
+    """Up lies on a grid, so rounding may take it to the next place there."""
+    pose = size * torch.randn(5, 24, 3, generator=torch.Generator().manual_seed(seed))
+    features = PoseFeatures((0, 3, 16, 17), "matrix")
+    found = features(pose)
+    assert found.shape == (5, features.size)
+    wanted = features(pose.clone().requires_grad_()).detach()
+    torch.testing.assert_close(found[:, :3], wanted[:, :3], atol=2.0**-13, rtol=0)
+    torch.testing.assert_close(found[:, 3:], wanted[:, 3:], atol=2e-6, rtol=0)
+
+
 def test_stacked_perceptrons_are_perceptrons() -> None:
     stack = StackedPerceptrons(3, 5, (4,), 6, activation="relu")
     x, mixture = torch.randn(7, 5), torch.rand(7, 3)

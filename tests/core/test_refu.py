@@ -149,6 +149,8 @@ def test_features_do_not_depend_on_heading_nor_on_full_turns(seed: int, turn: fl
     angle = pose.norm(dim=-1, keepdim=True)
     full_turn = pose * (1 + 2 * math.pi / angle)
     torch.testing.assert_close(scale_inputs(betas, full_turn, style), inputs, atol=1e-4, rtol=0)
+    tracked = scale_inputs(betas, full_turn.requires_grad_(), style).detach()
+    torch.testing.assert_close(tracked, inputs, atol=1e-4, rtol=0)
 
 
 def _homogeneous(rotation: Any) -> Any:
