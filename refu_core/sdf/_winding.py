@@ -29,10 +29,14 @@ class Winding:
         mesh.require_closed()
         device = faces.device
         self._body = memory(mesh.n_vertices, 3, device=device)
-        # The first point of each cell, the least distance in it, and the box around all points.
+        # The first point of each cell, the least distance in it, and the box around all points; of no points at first.
         n = 2 * _N_CELLS**2
-        self._first = memory(n, dtype=torch.int32, device=device)
-        self._farthest_in, self._box = memory(n, device=device), memory(2, 3, device=device)
+        self._empty, self._cells = memory(2, 2 * n + 6, dtype=torch.int32, device=device)
+        self._first, self._farthest_in, self._box = _parts(self._cells, n)
+        first, farthest_in, box = _parts(self._empty, n)
+        first.fill_(-1)
+        farthest_in.fill_(torch.inf)
+        box.copy_(torch.tensor([[torch.inf] * 3, [-torch.inf] * 3]))
         # A CPU's compiler keeps more in registers within a loop than from call to call.
         n_faces = len(mesh.faces)
         each = n_faces if device.type == "cpu" else 1
@@ -58,10 +62,7 @@ class Winding:
         points = points.to(device=device, dtype=torch.float32).contiguous()
         winding, following = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
         if n:
-            self._first.fill_(-1)
-            self._farthest_in.fill_(torch.inf)
-            self._box[0].fill_(torch.inf)
-            self._box[1].fill_(-torch.inf)
+            self._cells.copy_(self._empty)
             wanted = self._always if wanted is None else wanted
             listed = wanted, points, self._box, self._first, following, self._farthest_in
             n_strips, each = strips(n, device, at_least=IN_ROW)
@@ -69,3 +70,9 @@ class Winding:
             self._sort((n,), *listed)
             self._cross((self._n_threads,), *listed, winding)
         return winding
+
+
+def _parts(cells: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The first point of each of `n` cells, int32 (n,), the least distances there, (n,), and a box, (2, 3)."""
+    numbers = cells[n:].view(torch.float32)
+    return cells[:n], numbers[:n], numbers[n:].view(2, 3)
