@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refu_core._files import replacing
+from refu_core._files import write_file
 from refu_core._npz import MAX_TEXT_BYTES, read_npz
 from refu_core.body import BUILTIN_BODIES
 from refu_core.errors import GarmentError, MeshError, require_type
@@ -153,12 +154,9 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         arrays["styledirs"] = template.styledirs.cpu().double().numpy().reshape(n, 3, N_STYLES)
     if template.uv is not None:
         arrays |= {"uv": template.uv.coordinates, "uv_f": template.uv.faces.astype(np.uint32)}
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as file:
-            np.savez_compressed(file, **shortened(arrays))
-    except OSError as error:
-        raise GarmentError(f"{target}: can't be written: {error.strerror}") from error
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **shortened(arrays))
+    write_file(target, buffer.getbuffer(), error=GarmentError)
     return target
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from refu_core import backbones as nets
-from refu_core._files import replacing
+from refu_core._files import write_file
 from refu_core.body import JOINT_NAMES, SmplBody
 from refu_core.errors import RefuError, WeightsError
 from refu_core.frames import N_JOINTS
@@ -195,15 +195,8 @@ def bring_basis(source: Path, target: Path, *, written: str) -> None:
     basis = load_weights(source / "basis")
     nets.require_basis(target, str(basis.card["sha256"]), written=(written,))
     for name in ("basis.safetensors", "basis.json"):
-        there = target / name
-        try:
-            if there.exists() and there.samefile(source / name):
-                continue
-            target.mkdir(parents=True, exist_ok=True)
-            with replacing(there, sync=True) as file:
-                file.write((source / name).read_bytes())
-        except OSError as error:
-            raise WeightsError(f"{there}: can't be written: {error.strerror or error}") from error
+        if not (target / name).exists() or not (target / name).samefile(source / name):
+            write_file(target / name, (source / name).read_bytes(), error=WeightsError)
 
 
 def pivots_of(samples: data.TrainingSamples, n_pivots: int) -> Tensor:

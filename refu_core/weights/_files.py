@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from refu_core._files import InputFile, open_file, parse_json, replacing
+from refu_core._files import InputFile, open_file, parse_json, write_file
 from refu_core._npz import DAMAGE
 from refu_core._versions import versions
 from refu_core.errors import WeightsError, require_type
@@ -98,14 +98,8 @@ def save_weights(
     digest = hashlib.sha256(data).hexdigest()
     full = {"format": FORMAT, **card, **differs, "sha256": digest, "versions": versions("torch")}
     path = Path(f"{stem}.safetensors")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path, sync=True) as file:
-            file.write(data)
-        with replacing(Path(f"{stem}.json"), sync=True) as file:
-            file.write((json.dumps(full, indent=1) + "\n").encode())
-    except OSError as error:
-        raise WeightsError(f"{stem}: weights can't be written: {error}") from error
+    write_file(path, data, error=WeightsError)
+    write_file(Path(f"{stem}.json"), (json.dumps(full, indent=1) + "\n").encode(), error=WeightsError)
     return path
 
 
