@@ -139,8 +139,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
     require_name(_name_in(target))  # it becomes the garment's name when the file is read
     card = card_to_json(template.card).encode()
     if len(card) > MAX_TEXT_BYTES:
-        msg = f"{target}: wanted a card of at most {MAX_TEXT_BYTES} bytes, got {len(card)}: say less of its provenance"
-        raise GarmentError(msg)
+        raise GarmentError(f"{target}: the card has {len(card)} bytes, at most {MAX_TEXT_BYTES}: cut its provenance")
     n = template.n_vertices
     arrays: dict[str, Any] = {
         "v_template": template.v_template.cpu().double().numpy(),
@@ -219,8 +218,6 @@ def _check_uv(data: dict[str, NDArray[Any]], n_faces: int) -> None:
     uv, corners = data["uv"], data["uv_f"]
     is_right = uv.ndim == 2 and uv.shape[1] == 2 and uv.dtype.kind == "f" and np.isfinite(uv).all()
     if not is_right or corners.shape != (n_faces, 3) or corners.dtype.kind not in "iu":
-        msg = f"uv, uv_f: wanted finite numbers (T, 2) and integers {(n_faces, 3)}, got {uv.shape} and {corners.shape}"
-        raise ValueError(msg)
+        raise ValueError(f"uv, uv_f: wanted finite (T, 2), integers {(n_faces, 3)}, got {uv.shape} and {corners.shape}")
     if corners.min() < 0 or corners.max() >= len(uv):
-        msg = f"uv_f: wanted numbers of the {len(uv)} texture coordinates, got {corners.min()} to {corners.max()}"
-        raise ValueError(msg)
+        raise ValueError(f"uv_f: wanted indices of {len(uv)} coordinates, got {corners.min()} to {corners.max()}")

@@ -194,8 +194,7 @@ class PlannerMesh:
         self.faces: NDArray[np.int32] = _solid(self.sheet, len(kept))
         """Counter-clockwise from outside, shape (T, 3); the same in every frame."""
         if len(self.faces) > max_triangles:
-            msg = f"{garment.name} can't be drawn with {max_triangles} triangles, {len(self.faces)} are its least"
-            raise MeshError(msg)
+            raise MeshError(f"{garment.name} can't be drawn with {max_triangles} triangles: {len(self.faces)} at least")
         corners = np.repeat(np.arange(len(self.sheet)), 3)
         self._around = csr_array(
             (np.ones(3 * len(self.sheet)), (self.sheet.ravel(), corners)), shape=(len(kept), len(self.sheet))

@@ -36,11 +36,9 @@ def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]
     chains = [chain.split("+") for chain in _CHAINS.split()]
     missing = [name for chain in chains for name in chain if name not in names]
     if missing:
-        msg = f"{SOMA_NAMES}: wanted those of SOMA's body, without {', '.join(missing[:4])} among {len(names)}"
-        raise ValueError(msg)
+        raise ValueError(f"{SOMA_NAMES}: not those of SOMA's body: no {', '.join(missing[:4])} among {len(names)}")
     if word_of(content, root.get("absolute_pose")) in ("true", "1"):
-        msg = "SOMA's poses are absolute: save them relative to the T-pose (with joint_orient), which needs no model"
-        raise ValueError(msg)
+        raise ValueError("SOMA's poses are absolute: save them relative to the T-pose (with joint_orient)")
     turns, _ = rotvecs_of(content.array(root["poses"]), "poses", (len(names),), notes, has_root=True)
     poses = np.zeros((len(turns), N_JOINTS, 3))
     for joint, chain in enumerate(chains):

@@ -182,8 +182,7 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
         output.mkdir(parents=True, exist_ok=True)
         if not (output / "card.json").exists():
             if any(output.iterdir()):
-                msg = f"{output}: is neither empty nor a simulated data set; give another output directory"
-                raise SimulationError(msg)
+                raise SimulationError(f"{output}: is neither empty nor a simulated data set; give another directory")
             store.write_card(output, card)
             return
     except OSError as error:
@@ -191,8 +190,7 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
     there, wanted = store.read_card(output, card["format"]), json.loads(json.dumps(card))
     differing = [key for key in _MUST_AGREE if there.get(key) != wanted[key]]
     if differing:
-        msg = f"{output}: holds another set ({', '.join(differing)} differ); give another output directory"
-        raise SimulationError(msg)
+        raise SimulationError(f"{output}: holds another set ({', '.join(differing)} differ); give another directory")
 
 
 def simulate_dataset(

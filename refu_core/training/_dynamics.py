@@ -85,8 +85,7 @@ def train_dynamics(
     opened = data.TrainingSet.of(garment, dataset, body)
     template, body, rows, folder = opened.garment, opened.body, opened.rows, Path(folder)
     if not isinstance(rows, GarmentSequences):
-        msg = f"dynamics are learnt from sequences, got samples at rest: refu simulate {template.name} --sequences"
-        raise RefuError(msg)
+        raise RefuError(f"dynamics need sequences, got samples at rest: refu simulate {template.name} --sequences")
     test = data.read_samples(rows, body, template, split="test")  # a missing test split is reported before any work
     still, card_of_still = opened.tailornet(folder, mode)
     settings = settings or DynamicsSettings()

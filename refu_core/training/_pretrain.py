@@ -263,8 +263,7 @@ def tell_of(model: nets.Network, joints: Sequence[int], pose: Tensor) -> None:
     config, before = model.config, model.features.size
     others = [joint for joint in range(1, N_JOINTS) if joint not in config.joints]
     if config.encoding != "matrix":
-        msg = f"a network that sees the pose as {config.encoding} can't be told of further joints: train a new one"
-        raise RefuError(msg)
+        raise RefuError(f"a network that sees poses as {config.encoding} takes no further joints: train a new one")
     if len(set(joints)) < len(joints) or not set(joints) <= set(others):
         msg = f"wanted joints that the network isn't told of, each once ({', '.join(JOINT_NAMES[j] for j in others)}), "
         msg += f"got {', '.join(JOINT_NAMES[j] if 0 <= j < N_JOINTS else str(j) for j in joints)}"

@@ -43,8 +43,7 @@ def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] |
     except Exception as error:  # torch raises whatever its readers do
         raise WeightsError(f"{path}: a damaged checkpoint; delete it to start anew: {error}") from error
     if not isinstance(state, dict):
-        msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
-        raise WeightsError(msg)
+        raise WeightsError(f"{path}: a {type(state).__name__}, wanted a checkpoint; delete it to start anew")
     if identity is not None and state.get("identity") != identity:
         raise RefuError(f"{path}: of a training with other settings or data; delete it to start anew")
     return state

@@ -62,8 +62,7 @@ class SdfSettings:
     def __post_init__(self) -> None:
         """Raises `RefuError` for an unknown preset and for invalid numbers."""
         if self.preset not in SDF_PRESETS:
-            msg = f"no preset {self.preset!r} of the distance network: wanted one of {', '.join(SDF_PRESETS)}"
-            raise RefuError(msg)
+            raise RefuError(f"no preset {self.preset!r} of the distance network: wanted {', '.join(SDF_PRESETS)}")
         if min(self.steps, self.batch_size, self.check_every) < 1 or self.points < 8 or not self.learning_rate > 0:
             raise RefuError(f"steps, batch_size, points (8 or more) and rates must be positive, got {asdict(self)}")
 
