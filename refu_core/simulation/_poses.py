@@ -70,8 +70,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
         axes: axes of the files' roots; `auto` infers them from how people stand, and says so in `Clip.notes`.
         fps: frames a second, instead of what the files say.
 
-    Raises:
-        SimulationError: nothing there, or a file of another layout.
+    Raises `SimulationError` for nothing there, or a file of another layout.
     """
     path = Path(path)
     files = [path]

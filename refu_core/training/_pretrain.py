@@ -89,7 +89,8 @@ def pretrain(
     """Trains the backbone of one garment and writes `output`/basis and `output`/<backbone>-<mode>.
 
     A basis that is there already is used, so that all backbones and modes in a folder share it. If interrupted, the
-    same call goes on from the last checkpoint. Under `torchrun` all processes share one training.
+    same call goes on from the last checkpoint. Under `torchrun` all processes share one training. Returns the card:
+    what was trained on what, and its figures on the test split.
 
     Args:
         garment: name of a built-in garment, or a template.
@@ -106,9 +107,6 @@ def pretrain(
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
         quiet: show no progress.
-
-    Returns:
-        The card: what was trained on what, and its figures on the test split.
 
     Raises:
         RefuError: the set is of another garment or body or too small, or a checkpoint there is of another training.

@@ -32,9 +32,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
 def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] | None:
     """What `save_checkpoint` wrote; None where there is nothing. No pickled code is run.
 
-    Raises:
-        RefuError: the state's "identity" is another one: the checkpoint is of another training.
-        WeightsError: the file is damaged.
+    Raises `RefuError` for another "identity" in the state, of another training, and `WeightsError` for a damaged file.
     """
     if not os.path.lexists(path):
         return None

@@ -190,14 +190,11 @@ def train_sdf(
 
     If interrupted, it goes on from the last checkpoint and ends with the same weights: what is drawn for a step depends
     only on the seed and the number of the step. Under `torchrun` every process takes its share of the bodies. On a GPU
-    it computes in bfloat16, with weights in float32.
+    it computes in bfloat16, with weights in float32. Returns the card: settings and figures, on held-out pairs of the
+    training split and on the test split.
 
-    Returns the card: settings and figures, on held-out pairs of the training split and on the test split.
-
-    Raises:
-        RefuError: a set of another garment or body, a checkpoint of another training, a split without samples, or a
-            loss that isn't finite.
-        WeightsError: a damaged checkpoint, or a disk that can't be written.
+    Raises `RefuError` for a set of another garment or body, a checkpoint of another training, a split without samples,
+    or a loss that isn't finite; `WeightsError` for a damaged checkpoint, or a disk that can't be written.
     """
     check_set(dataset, body, garment)
     settings = settings or SdfSettings()
