@@ -252,7 +252,8 @@ def _poses(
                 if any(part in word for part in _ROOTS) and not any(part in word for part in _NO_ROOTS)
             ]
             if others:
-                raise ValueError(f"{names[0]} has no root, and {others[0]} may be it: save it as root_orient")
+                msg = f"{names[0]} has no root, and {others[0]} may be it: save it as root_orient with pose_body"
+                raise ValueError(msg)
             notes.append(f"{names[0]} has no root: the person stands upright and looks along z")
             root, body = np.zeros((len(whole), 1, 3)), whole
         else:
