@@ -123,7 +123,8 @@ def _pose(text: str | None) -> NDArray[np.float64] | None:
         return pose
     angle = 0.0 if text == "t" else _number(text)
     if not -90 <= angle <= 90:
-        raise GarmentError(f"no pose {text!r}: wanted t, the degrees that the arms hang down (45), or a motion .npz")
+        msg = f"no pose {text!r}: wanted t, the angle in degrees that the arms hang down (45), or a motion .npz"
+        raise GarmentError(msg)
     return fitting.standing_pose(np.radians(angle))
 
 

@@ -55,7 +55,8 @@ def n_resampled(n: int, fps: float, wanted: float) -> int:
     """How many frames `n` at `fps` become at the rate `wanted`. Raises `ValueError` for more than `MAX_FRAMES`."""
     count = int((n - 1) / fps * check_fps(wanted) + 1e-9) + 1
     if count > MAX_FRAMES:
-        raise ValueError(f"{n} frames at {fps:g} Hz are {count} at {wanted:g} Hz, at most {MAX_FRAMES}; cut the clip")
+        msg = f"{n} frames at {fps:g} Hz are {count} at {wanted:g} Hz, at most {MAX_FRAMES} are made; cut the clip"
+        raise ValueError(msg)
     return count
 
 

@@ -42,7 +42,8 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, has_age: b
         notes.append("no betas: the mean shape, unless betas are given")
         return betas
     if array.dtype.kind not in "iuf" or array.ndim > 3 or (array.ndim > 1 and len(array) not in (1, n)):
-        raise ValueError(f"betas must be one row, or a row for each of {n} frames, got {array.dtype} {array.shape}")
+        msg = f"betas must be one row of coefficients, or a row for each of {n} frames, got {array.dtype} {array.shape}"
+        raise ValueError(msg)
     rows = np.atleast_1d(array).astype(np.float64)
     rows = rows.reshape(-1, rows.shape[-1])
     if has_age and rows.shape[1] == N_BETAS + 1 and len(rows) and np.any(rows[:, -1]):

@@ -154,7 +154,8 @@ def _replay_many(args: argparse.Namespace) -> int:
     from refu_lab.fleet.replay import FleetOptions, replay_fleet
 
     if args.output is not None and args.output.endswith(".mcap"):
-        raise RefuError(f"--output {args.output}: of several inputs, a folder, which gets a bag of each; name one")
+        msg = f"--output {args.output}: of several inputs that is a folder, which gets a bag of each; name one"
+        raise RefuError(msg)
     recordings = find_recordings(args.input, results=(args.output, args.report))
     each = ReplayOptions(**cli.given(args, ReplayOptions) | {"input": Path(), "output": None})
     options = FleetOptions(replay=each, output=args.output, report=args.report, again=args.again or args.overwrite)

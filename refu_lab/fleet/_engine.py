@@ -164,7 +164,7 @@ class DaskEngine:
         try:
             return future.result()  # if its worker has died since, the task is run again
         except (CancelledError, CommClosedError) as error:
-            raise FleetError("the Dask scheduler is gone, what is done is kept: give the command again") from error
+            raise FleetError("the Dask scheduler is gone, what is done is kept: give the same command again") from error
         except KilledWorker:
             return Lost("one worker after another died with it (out of memory?)")
         except ImportError as error:
