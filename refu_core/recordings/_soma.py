@@ -36,7 +36,8 @@ def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]
     chains = [chain.split("+") for chain in _CHAINS.split()]
     missing = [name for chain in chains for name in chain if name not in names]
     if missing:
-        raise ValueError(f"{SOMA_NAMES}: not those of SOMA's body: no {', '.join(missing[:4])} among {len(names)}")
+        msg = f"{SOMA_NAMES}: wanted those of SOMA's body, without {', '.join(missing[:4])} among {len(names)}"
+        raise ValueError(msg)
     if word_of(content, root.get("absolute_pose")) in ("true", "1"):
         raise ValueError("SOMA's poses are absolute: save them relative to the T-pose (with joint_orient)")
     turns, _ = rotvecs_of(content.array(root["poses"]), "poses", (len(names),), notes, has_root=True)
