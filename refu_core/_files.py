@@ -137,11 +137,22 @@ def replacing(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
             part.unlink()
 
 
-@contextlib.contextmanager
-def exclusive(path: Path, *, error: RefuError, is_kept: bool = True) -> Iterator[None]:
-    """Holds a lock file. The lock is released when the process ends, however it ends.
+def write_file(path: Path, content: bytes | memoryview, *, error: type[RefuError], what: str = "the file") -> None:
+    """Writes a file as `replacing` does, onto the disk, in a folder that is made if it isn't there.
 
-    The file stays unless `is_kept` is false: then it is removed at the end of the block.
+    Raises `error`, which says `what` it is, if it can't be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path, sync=True) as file:
+            file.write(content)
+    except OSError as cause:
+        raise error(f"{path}: {what} can't be written: {cause.strerror or cause}") from cause
+
+
+@contextlib.contextmanager
+def exclusive(path: Path, *, error: RefuError) -> Iterator[None]:
+    """Holds a lock file, and removes it at the end. The lock is released when the process ends, however it ends.
 
     Raises `error` when another process has it, `OSError` when the file can't be written.
     """
@@ -161,9 +172,8 @@ def exclusive(path: Path, *, error: RefuError, is_kept: bool = True) -> Iterator
         try:
             yield
         finally:
-            if not is_kept:
-                with contextlib.suppress(OSError):
-                    path.unlink()
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 def _finite(text: str) -> float:

@@ -89,8 +89,7 @@ def _build(module: Any, folder: Path, plain: Callable[[], Any]) -> Any:
     except Exception as error:
         if isinstance(error, OSError) or is_device_loss(error):
             raise
-        msg = f"the kernels of {module.name} can't be built ({error}): delete {folder} and try again"
-        raise RefuError(msg) from error
+        raise RefuError(f"the kernels of {module.name} can't be built ({error}): delete {folder}, try again") from error
     with contextlib.suppress(OSError):  # the kernels are loaded; without checksums the next start builds them again
         part = folder / f"{_SUMS}.part"
         part.write_text(json.dumps(_sums(folder)))

@@ -67,8 +67,7 @@ class ArrayBudget:
             raise ValueError(f"an array of {dtype}, wanted plain numbers of at most 64 bits")
         self._left -= count
         if self._left < 0:
-            msg = f"an array {shape} takes {count >> 17} MiB as float64, at most {MAX_BYTES >> 20} MiB are read"
-            raise ValueError(msg)
+            raise ValueError(f"an array {shape} takes {count >> 17} MiB as float64, at most {MAX_BYTES >> 20} are read")
 
 
 def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wanted: str) -> dict[str, NDArray[Any]]:

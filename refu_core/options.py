@@ -153,8 +153,7 @@ class PipelineOptions:
         checked_device(self.device)
         for body in (self.body, self.betas_from):
             if body not in ("", *BUILTIN_BODIES) and not Path(body).is_file():
-                msg = f"no body {body!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or an .npz or .pkl file"
-                raise SettingsError(msg)
+                raise SettingsError(f"no body {body!r}: wanted {', '.join(BUILTIN_BODIES)}, or an .npz or .pkl file")
         if self.weights and not Path(self.weights).is_dir():
             raise SettingsError(f"no weights {self.weights!r}: wanted a folder")
         is_auto = self.backbone == BackboneName.AUTO

@@ -27,22 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _PICTURE = (420, 640)
-STYLE = """
-:root { color-scheme: light dark; --line: color-mix(in srgb, currentColor 18%, transparent); }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; margin-bottom: .2rem; } h2 { font-size: 1.1rem; margin-top: 2.2rem; }
-p.note, figcaption { opacity: .75; font-size: .9rem; }
-table { border-collapse: collapse; width: 100%; } th, td { padding: .3rem .6rem; border-bottom: 1px solid var(--line); }
-td, th { text-align: right; font-variant-numeric: tabular-nums; } td:first-child, th:first-child { text-align: left; }
-img { max-width: 100%; border-radius: 6px; } img.plot { background: #fff; width: 100%; }
-.wide { overflow-x: auto; } .wide img.plot { min-width: 620px; } th { vertical-align: bottom; }
-td { white-space: nowrap; }
-.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); gap: 1.6rem 1.2rem; }
-.pair { display: grid; grid-template-columns: 1fr 1fr; gap: .4rem; } .pair span { position: relative; display: block; }
-.pair span::after { content: attr(title); position: absolute; left: .6rem; top: .4rem; font-size: .85rem; color: #444; }
-figure { margin: 0; } .warn { border-left: 4px solid #d33; padding-left: .8rem; overflow-wrap: anywhere; }
-@media (prefers-color-scheme: dark) { img.plot { filter: invert(.9) hue-rotate(180deg); } }
-"""
+STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 
 
 def write_report(result: ReplayResult, folder: Path, *, progress: bool = False) -> Path:

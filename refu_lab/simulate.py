@@ -51,13 +51,8 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
     if not card["counts"]["to_do"]:
         if card["counts"]["given_up"] == options.count:
             causes = ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in card["yield"]["dropped"].items() if n)
-            msg = (
-                f"all {options.count} samples were given up, no attempt passed: {causes}; look at how the garment lies "
-            )
-            msg += (
-                "on the body and what `refu garment add` says of its mesh (slivers, panels, pictures), or simulate more"
-            )
-            raise SimulationError(msg)
+            hint = "look at how it lies on the body and what `refu garment add` says of its mesh, or simulate more"
+            raise SimulationError(f"all {options.count} samples were given up: {causes}; {hint}")
         sheet = contact_sheet(GarmentDataset(options.output), body=options.body, garments=options.garments)
         save_png(sheet, options.output / SHEET)
     return card

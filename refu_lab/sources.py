@@ -132,8 +132,7 @@ def open_source(options: RecordingOptions, pipeline: GarmentPipeline | None = No
         msg += "" if options.fps is not None else "; the axes of bags are smpl or frame"
         raise RefuError(msg)
     if options.person is not None and options.input_type not in adapters.KEYPOINT_TYPES:
-        msg = f"{options.input}: --person is for keypoints and files of motion; of bags, --topic says whose parameters"
-        raise RefuError(msg)
+        raise RefuError(f"{options.input}: --person is for keypoints and files of motion; of bags, --topic says whose")
     bag = adapters.open_smpl_bag(options.input, topic=options.topic, input_type=options.input_type)
     topic, kind = bag.topic.name, bag.topic.message_type
     given, is_placed = _frame_of_first(bag)

@@ -10,7 +10,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from refu_core._files import replacing
+from refu_core._files import write_file
 from refu_core.errors import RefuError, printable
 
 if TYPE_CHECKING:
@@ -83,21 +83,12 @@ def picture_markdown(file: str, caption: str) -> str:
 
 def write_page(path: Path, parts: Sequence[str]) -> None:
     """Writes a page from its parts, in full or not at all. Raises `RefuError` if it can't be written."""
-    _write(path, "\n\n".join(parts))
+    write_file(path, ("\n\n".join(parts) + "\n").encode(), error=RefuError)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes plain values, in full or not at all. Raises `RefuError` if the file can't be written."""
-    _write(path, json.dumps(content, indent=1, allow_nan=False))
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            file.write((text + "\n").encode())
-    except OSError as error:
-        raise RefuError(f"{path.parent}: the results can't be written: {error.strerror or error}") from error
+    write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode(), error=RefuError)
 
 
 def replay_table(result: ReplayResult) -> str:

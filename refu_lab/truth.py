@@ -66,8 +66,7 @@ def _vertices(marker: adapters.Marker, faces: NDArray[np.int64]) -> NDArray[np.f
         return adapters.vertices_from_points(marker.points, faces)
     count = int(faces.max()) + 1
     if marker.points.shape != (count, 3):
-        msg = f"{TOPIC}: wanted the {count} vertices of {marker.ns}, got points {marker.points.shape}"
-        raise adapters.DecodeError(msg)
+        raise adapters.DecodeError(f"{TOPIC}: wanted the {count} vertices of {marker.ns}, got {marker.points.shape}")
     return marker.points
 
 

@@ -23,18 +23,7 @@ from numpy.typing import NDArray
 from refu_core import RefuError
 from refu_lab.render import COLLIDING, RenderMesh, sky_light
 
-STYLE = """
-#turntable canvas { width: 100%; height: min(78vh, 620px, 125vw); touch-action: pan-y; cursor: grab;
-  border-radius: 6px; background: radial-gradient(ellipse at 50% 40%, #f3f4f6, #d5d9df); outline-offset: 2px; }
-#turntable canvas:active { cursor: grabbing; }
-#turntable > div { display: flex; flex-wrap: wrap; gap: .5rem 1rem; margin: .6rem 0; }
-.choice { display: inline-flex; border: 1px solid var(--line); border-radius: 6px; overflow: hidden; }
-.choice button { font: inherit; font-size: .9rem; padding: .25rem .8rem; border: 0; background: none; color: inherit;
-  cursor: pointer; }
-.choice button[aria-pressed=true] { background: #2c6296; color: #fff; }
-@media (prefers-color-scheme: dark) {
-  #turntable canvas { background: radial-gradient(ellipse at 50% 40%, #4a4f57, #26292e); } }
-"""
+STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 _GRID = (1 << 14) - 1
 """Grid steps along the longest side of a frame's bounding box."""
 _MOST = 1 << 15

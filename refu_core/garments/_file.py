@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from refu_core._files import replacing
+from refu_core._files import write_file
 from refu_core._npz import MAX_TEXT_BYTES, read_npz
 from refu_core.body import BUILTIN_BODIES
 from refu_core.errors import GarmentError, MeshError, require_type
@@ -138,8 +139,7 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
     require_name(_name_in(target))  # it becomes the garment's name when the file is read
     card = card_to_json(template.card).encode()
     if len(card) > MAX_TEXT_BYTES:
-        msg = f"{target}: wanted a card of at most {MAX_TEXT_BYTES} bytes, got {len(card)}: say less of its provenance"
-        raise GarmentError(msg)
+        raise GarmentError(f"{target}: the card has {len(card)} bytes, at most {MAX_TEXT_BYTES}: cut its provenance")
     n = template.n_vertices
     arrays: dict[str, Any] = {
         "v_template": template.v_template.cpu().double().numpy(),
@@ -153,12 +153,9 @@ def save_garment(template: GarmentTemplate, path: str | os.PathLike[str]) -> Pat
         arrays["styledirs"] = template.styledirs.cpu().double().numpy().reshape(n, 3, N_STYLES)
     if template.uv is not None:
         arrays |= {"uv": template.uv.coordinates, "uv_f": template.uv.faces.astype(np.uint32)}
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as file:
-            np.savez_compressed(file, **shortened(arrays))
-    except OSError as error:
-        raise GarmentError(f"{target}: can't be written: {error.strerror}") from error
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **shortened(arrays))
+    write_file(target, buffer.getbuffer(), error=GarmentError)
     return target
 
 
@@ -221,8 +218,6 @@ def _check_uv(data: dict[str, NDArray[Any]], n_faces: int) -> None:
     uv, corners = data["uv"], data["uv_f"]
     is_right = uv.ndim == 2 and uv.shape[1] == 2 and uv.dtype.kind == "f" and np.isfinite(uv).all()
     if not is_right or corners.shape != (n_faces, 3) or corners.dtype.kind not in "iu":
-        msg = f"uv, uv_f: wanted finite numbers (T, 2) and integers {(n_faces, 3)}, got {uv.shape} and {corners.shape}"
-        raise ValueError(msg)
+        raise ValueError(f"uv, uv_f: wanted finite (T, 2), integers {(n_faces, 3)}, got {uv.shape} and {corners.shape}")
     if corners.min() < 0 or corners.max() >= len(uv):
-        msg = f"uv_f: wanted numbers of the {len(uv)} texture coordinates, got {corners.min()} to {corners.max()}"
-        raise ValueError(msg)
+        raise ValueError(f"uv_f: wanted indices of {len(uv)} coordinates, got {corners.min()} to {corners.max()}")

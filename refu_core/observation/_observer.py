@@ -68,9 +68,8 @@ class Observer:
                 (N, 3); None if nothing was measured: what was learnt is used, and fades.
             eye: where the camera is in the same axes [m], shape (3,): cloth that faces away from it isn't matched.
 
-        Raises:
-            FrameError: points or eye of another shape, or not finite. What was learnt is kept.
-            RefuError: as the pipeline does.
+        Raises `FrameError` for points or eye of another shape, or not finite (what was learnt is kept), and as the
+        pipeline does.
         """
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
         measured = np.empty((0, 3)) if points is None else _finite("points", points, 2)

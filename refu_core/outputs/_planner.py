@@ -136,10 +136,9 @@ _VERSION = 3
 """Version of what is cached; a result of any other version is computed anew."""
 _POSES = {
     "T-pose": "",
-    "stands": "left_shoulder 0 0 -1.15, right_shoulder 0 0 1.15",
-    "arms overhead": "left_shoulder 0 0 0.95, right_shoulder 0 0 -0.95, left_collar 0 0 0.3, right_collar 0 0 -0.3",
-    "squats": "left_hip -1.3 0.2 0.4, right_hip -1.3 -0.2 -0.4, left_knee 1.7 0 0, right_knee 1.7 0 0, spine1 0.2 0 0, "
-    "left_shoulder 0.2 0 -0.7, right_shoulder 0.2 0 0.7",
+    "stands": "both_shoulder 0 0 -1.15",
+    "arms overhead": "both_shoulder 0 0 0.95, both_collar 0 0 0.3",
+    "squats": "both_hip -1.3 0.2 0.4, both_knee 1.7 0 0, spine1 0.2 0 0, both_shoulder 0.2 0 -0.7",
     "walks": "left_hip -0.6 0 0.05, right_hip 0.35 0 0, left_knee 0.3 0 0, right_knee 0.6 0 0, spine2 0 0.15 0, "
     "left_shoulder 0.3 0.1 -1.1, right_shoulder -0.3 0.3 1.1, left_elbow 0 -0.4 0, right_elbow 0 0.5 0",
     "reaches forward": "left_shoulder 0 -0.9 -0.3, right_shoulder 0.2 0 1.2, left_elbow 0 -0.5 0, spine1 0.15 0.1 0, "
@@ -153,7 +152,7 @@ _POSES = {
     "sits": "left_hip -1.5 0 0.15, right_hip -1.5 0 -0.1, left_knee 1.5 0 0, right_knee 1.4 0 0, "
     "left_shoulder 0.2 -0.2 -1.2, right_shoulder 0.2 0.4 1.1, right_elbow 0 1.2 0",
 }
-"""Poses in which a planner's mesh has to fit: joints and their rotation vectors [rad]."""
+"""Poses in which a planner's mesh has to fit, as `refu_core.skeleton.posed` reads them [rad]."""
 Worn = NDArray[np.float64]
 
 
@@ -194,8 +193,7 @@ class PlannerMesh:
         self.faces: NDArray[np.int32] = _solid(self.sheet, len(kept))
         """Counter-clockwise from outside, shape (T, 3); the same in every frame."""
         if len(self.faces) > max_triangles:
-            msg = f"{garment.name} can't be drawn with {max_triangles} triangles, {len(self.faces)} are its least"
-            raise MeshError(msg)
+            raise MeshError(f"{garment.name} can't be drawn with {max_triangles} triangles: {len(self.faces)} at least")
         corners = np.repeat(np.arange(len(self.sheet)), 3)
         self._around = csr_array(
             (np.ones(3 * len(self.sheet)), (self.sheet.ravel(), corners)), shape=(len(kept), len(self.sheet))

@@ -71,11 +71,8 @@ class PinholeCamera:
     ) -> PinholeCamera:
         """A camera at `eye` [m], shape (3,), that has `target` [m] in the middle and the y axis up.
 
-        `fov` is the angle from its left to its right border [rad].
-
-        Raises:
-            FrameError: `target` or `eye` aren't three numbers.
-            MeshError: `fov` isn't between 0 and π; or it looks straight up or down, or nowhere, or has no width.
+        `fov` is the angle from its left to its right border [rad]. Raises `FrameError` unless `target` and `eye` are
+        three numbers; `MeshError` for a `fov` beyond 0 to π, no width, and a camera that looks straight up or down.
         """
         target, eye = (checked_numbers(name, at, (3,), np.float64) for name, at in (("target", target), ("eye", eye)))
         if not 0 < fov < math.pi or not width > 0:

@@ -89,8 +89,7 @@ def _parsed(text: str) -> tuple[list[_Joint], Array, float]:
     count = count or numbers.size // n_channels  # programs that were stopped leave a zero there
     if not 0 < count <= MAX_FRAMES or numbers.size != count * n_channels or not np.isfinite(numbers).all():
         finite = int(np.isfinite(numbers).sum())
-        msg = f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite} in all"
-        raise ValueError(msg)
+        raise ValueError(f"wanted {count} frames (1 to {MAX_FRAMES}) of {n_channels} finite numbers, got {finite}")
     given = np.concatenate((numbers, *(joint.offset for joint in joints)))
     if not (np.abs(given) < _LARGEST).all():
         raise ValueError(f"wanted offsets, places and angles below {_LARGEST:g}, got {np.abs(given).max():g}")

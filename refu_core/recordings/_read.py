@@ -66,8 +66,7 @@ def read_recording(
     """
     path = Path(path)
     if axes not in AXES or not isinstance(fps, (int, float, type(None))):
-        msg = f"{path}: wanted axes of {', '.join(AXES)} and frames a second as a number, got {axes!r} and {fps!r}"
-        raise error(msg)
+        raise error(f"{path}: wanted axes of {', '.join(AXES)} and fps as a number, got {axes!r} and {fps!r}")
     person = None if person is None else str(person)
     if path.suffix.lower() == ".bvh":
         if person is not None:
@@ -208,8 +207,7 @@ def _by_time(array: NDArray[Any]) -> NDArray[Any]:
 
 def _checked(array: NDArray[Any], name: str) -> NDArray[Any]:
     if not _is_of_places({name: array}):
-        msg = f"{name}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones"
-        raise ValueError(msg)
+        raise ValueError(f"{name}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones")
     return array
 
 

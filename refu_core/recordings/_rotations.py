@@ -182,8 +182,7 @@ def _of_six(six: Array, name: str, notes: list[str], *, first: int) -> Array:
         uneven = {way: _unevenness(*pair) for way, pair in pairs.items()}
     way = min(uneven, key=lambda key: uneven[key])
     if not uneven[way] <= _MOST_UNEVEN:
-        msg = f"{name} {six.shape}: six numbers a joint that aren't two rows or columns of a rotation matrix"
-        raise ValueError(msg)
+        raise ValueError(f"{name} {six.shape}: six numbers a joint that aren't two rows or columns of a rotation")
     columns = _completed(*pairs[way])
     if way == "interleaved columns":
         notes.append(f"{name} holds 6D rotations, taken as interleaved columns")

@@ -39,8 +39,7 @@ def smpl_of_soma(content: Content, notes: list[str], pelvis: NDArray[np.float64]
         msg = f"{SOMA_NAMES}: wanted those of SOMA's body, without {', '.join(missing[:4])} among {len(names)}"
         raise ValueError(msg)
     if word_of(content, root.get("absolute_pose")) in ("true", "1"):
-        msg = "SOMA's poses are absolute: save them relative to the T-pose (with joint_orient), which needs no model"
-        raise ValueError(msg)
+        raise ValueError("SOMA's poses are absolute: save them relative to the T-pose (with joint_orient)")
     turns, _ = rotvecs_of(content.array(root["poses"]), "poses", (len(names),), notes, has_root=True)
     poses = np.zeros((len(turns), N_JOINTS, 3))
     for joint, chain in enumerate(chains):

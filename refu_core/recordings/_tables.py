@@ -39,8 +39,7 @@ def told_apart(content: Content, notes: list[str]) -> Content:
         n = _n_rows(content, node)
         left -= n
         if left < 0:
-            msg = f"tables of more than {_MOST_ROWS} rows with columns of persons or images; save fewer rows in a file"
-            raise ValueError(msg)
+            raise ValueError(f"tables of more than {_MOST_ROWS} rows with columns of persons or images; save fewer")
         people = _people(content, node, n, notes) if n > 1 else None
         if people is not None:
             found[id(node)] = people

@@ -229,15 +229,14 @@ class SimulatedCloth:
     def frame(self, body_from: F32, body_to: F32, *, gravity: F32, drag: float, careful: bool = False) -> float:
         """Simulates `settings.substeps` time steps while the body moves straight from one mesh (V, 3) to the other.
 
+        Returns the root mean square speed of the vertices at the end [m/s].
+
         Args:
             body_from: body vertices at the start [m], shape (V, 3).
             body_to: the same at the end; the very same object where the body rests.
             gravity: acceleration [m/s²], shape (3,).
             drag: rate at which the velocity fades [1/s].
             careful: solve contacts of edge midpoints, too, and search for contacts as often as on a moving body.
-
-        Returns:
-            Root mean square speed of the vertices at the end [m/s].
         """
         from refu_core.simulation._solver import substep
 

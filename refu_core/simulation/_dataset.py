@@ -128,8 +128,7 @@ class _Finished:
         clips = self.card.get("clips")
         names = {split: clips.get(split) for split in ("train", "test")} if isinstance(clips, dict) else {}
         if not names or not all(isinstance(value, list) for value in names.values()):
-            msg = f"wanted a card with the names of the motions in clips.train and clips.test, got {str(clips)[:80]}"
-            raise SimulationError(msg)
+            raise SimulationError(f"wanted motions' names in the card's clips.train and clips.test, got {clips!s:.80}")
         return {split: [str(name) for name in value or ()] for split, value in names.items()}
 
     def _check(self, name: str, low: float, high: Any) -> None:
@@ -177,8 +176,7 @@ class GarmentDataset(_Finished):
         plan = self.card.get("plan")
         count = plan.get("count") if isinstance(plan, dict) else None
         if not isinstance(count, int) or not 0 <= count < 2**31:
-            msg = f"{path}: wanted a card with the number of samples in plan.count, got {str(count)[:80]}"
-            raise SimulationError(msg)
+            raise SimulationError(f"{path}: wanted the number of samples in the card's plan.count, got {count!s:.80}")
         self._check("slot", 0, count - 1)
         self._unseen = store.read_unseen(self._path, count)
 

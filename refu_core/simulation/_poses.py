@@ -70,8 +70,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
         axes: axes of the files' roots; `auto` infers them from how people stand, and says so in `Clip.notes`.
         fps: frames a second, instead of what the files say.
 
-    Raises:
-        SimulationError: nothing there, or a file of another layout.
+    Raises `SimulationError` for nothing there, or a file of another layout.
     """
     path = Path(path)
     files = [path]
@@ -80,8 +79,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
         # AMASS keeps shapes without motion among its motions.
         files = [file for file in files if file.name != "shape.npz" and not file.stem.endswith("_stagei")]
     if not files or not files[0].exists():
-        msg = f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder of them or a file"
-        raise SimulationError(msg)
+        raise SimulationError(f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder or a file")
     clips, folder = [], path if path.is_dir() else path.parent
     for file in files:
         found = read_recording(file, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
@@ -103,8 +101,7 @@ def split_clips(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
     Raises `SimulationError` for fewer than two clips, which can't be split.
     """
     if len(clips) < 2:
-        msg = f"wanted two motions or more, so that whole ones can be kept for the test; got {len(clips)}"
-        raise SimulationError(msg)
+        raise SimulationError(f"wanted two motions or more, to keep whole ones for the test; got {len(clips)}")
     ordered = sorted(clips, key=lambda clip: clip.name)
     test = [clip for i, clip in enumerate(ordered) if i % 5 == 1]
     return [clip for clip in ordered if clip not in test], test

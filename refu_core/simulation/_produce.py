@@ -182,8 +182,7 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
         output.mkdir(parents=True, exist_ok=True)
         if not (output / "card.json").exists():
             if any(output.iterdir()):
-                msg = f"{output}: is neither empty nor a simulated data set; give another output directory"
-                raise SimulationError(msg)
+                raise SimulationError(f"{output}: is neither empty nor a simulated data set; give another directory")
             store.write_card(output, card)
             return
     except OSError as error:
@@ -191,8 +190,7 @@ def _open_set(output: Path, card: dict[str, Any]) -> None:
     there, wanted = store.read_card(output, card["format"]), json.loads(json.dumps(card))
     differing = [key for key in _MUST_AGREE if there.get(key) != wanted[key]]
     if differing:
-        msg = f"{output}: holds another set ({', '.join(differing)} differ); give another output directory"
-        raise SimulationError(msg)
+        raise SimulationError(f"{output}: holds another set ({', '.join(differing)} differ); give another directory")
 
 
 def simulate_dataset(
@@ -210,7 +208,7 @@ def simulate_dataset(
     """Simulates a data set of `count` samples of a built-in garment, or goes on with one that was interrupted.
 
     The same arguments give the same samples, whatever `engine` is and however often the work was interrupted. Finished
-    samples are on disk at any time and can be read while others are made.
+    samples are on disk at any time and can be read while others are made. Returns the card of the set.
 
     Args:
         garment, count: as in `SamplePlan`; the layers of garments that are worn together never cross.
@@ -222,15 +220,9 @@ def simulate_dataset(
         progress: called in this process after each slot.
         plan: other fields of `SamplePlan`, such as `seed` and `posture_share`; without `postures`, all are drawn.
 
-    Returns:
-        The card of the set, as it stands in `card.json`.
-
-    Raises:
-        SimulationError: motions of another layout, a full disk, a directory that holds another set, one that
-            another run is writing, or processes that were killed again and again (what is finished is kept; run again
-            to go on).
-        MeshError: the body isn't watertight.
-        BodyError, GarmentError: no such body or garment.
+    Raises `SimulationError` for motions of another layout, a full disk, a directory that holds another set or that
+    another run is writing, and processes that were killed again and again (what is finished is kept); `MeshError` for a
+    body that isn't watertight; `BodyError` or `GarmentError` for no such body or garment.
     """
     clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(as_clips(motions))
     if motions is None:

@@ -114,8 +114,7 @@ class SequencePlan:
     def __post_init__(self) -> None:
         """Raises `SimulationError` for numbers that make no plan."""
         if self.count < 1 or self.shapes < 1 or not 0 < self.seconds <= 600 or self.n_frames < 2:
-            msg = f"wanted a sequence and a shape at least, and two frames to 600 s, got {asdict(self)}"
-            raise SimulationError(msg)
+            raise SimulationError(f"wanted a sequence and a shape at least, two frames to 600 s, got {asdict(self)}")
         if not (0 <= self.test_share < 1 and self.spread > 0):
             raise SimulationError(f"the test's share must lie in [0, 1) and the spread above 0, got {asdict(self)}")
 
@@ -246,7 +245,6 @@ def simulate_sequences(
     """
     slots = SequencePlan(garment, count, **plan)
     if motions is None:
-        msg = f"sequences need recorded motion: give a folder of motion files, of {slots.seconds:g} s or more each"
-        raise SimulationError(msg)
+        raise SimulationError(f"sequences need recorded motion: give a folder of files of {slots.seconds:g} s or more")
     given = slots, split_clips(as_clips(motions)), settings or SequenceSettings(), body
     return produce(SequenceSimulator, *given, output=output, engine=engine, progress=progress, fps=FPS)

@@ -104,8 +104,7 @@ class Rows:
         }
         shape, n = self.arrays["vertices"].shape[1:], self.arrays["slot"].size
         if len(shape) != (2 if kind == FORMAT else 3):
-            msg = f"{self.directory}: wanted garments in a set of the format {kind}, got vertices of the shape {shape}"
-            raise SimulationError(msg)
+            raise SimulationError(f"{self.directory}: wanted vertices of the format {kind}, got the shape {shape}")
         for name, (row, dtype) in columns_of(kind, shape).items():
             array = self.arrays[name]
             if array.shape != (n, *row) or array.dtype != np.dtype(dtype):
@@ -177,8 +176,7 @@ def read_card(directory: Path, *kinds: str) -> dict[str, Any]:
     card = read_json(path, error=SimulationError, wanted="the card of a simulated data set")
     got = card.get("format") if isinstance(card, dict) else None
     if got not in kinds:
-        msg = f"{path}: wanted the card of a data set of the format {' or '.join(kinds)}, got the format {got!r}"
-        raise SimulationError(msg)
+        raise SimulationError(f"{path}: wanted a data set's card of the format {' or '.join(kinds)}, got {got!r}")
     found: dict[str, Any] = card
     return found
 

@@ -47,23 +47,15 @@ def train_beyond(
 ) -> dict[str, Any]:
     """Trains what is added to the garment's tailornet in `folder` in postures of a kind, and writes `folder`/<kind>.
 
-    Samples in other postures are left out. If interrupted, the same call goes on from the last checkpoint.
+    Samples in other postures are left out. All else, and what is returned, is as in `pretrain`; figures stand beside
+    those of the tailornet alone. Raises `RefuError` as that does, for no such kind, and for too few people in such
+    postures to learn from or test on; `WeightsError` for no tailornet there, or a damaged one.
 
     Args:
         kind: `lying`, or `legs` for thighs that are apart or drawn up.
         folder: holds tailornet-<mode> and its basis, which are left as they are.
         rehearsal: bodies of the tailornet's plans. To those of them who are in such a posture nothing is added.
         mode: mode of the tailornet; modes that share a basis share this, too.
-        settings: the default ones if not given.
-        garment, dataset, body, device, quiet: as in `pretrain`.
-
-    Returns:
-        The card: what was trained on what, and its figures on its test samples, beside the tailornet's.
-
-    Raises:
-        RefuError: no such kind, the set is of another garment or body, has too few people in such postures or none to
-            test on, or a checkpoint there is of another training.
-        WeightsError: no tailornet there, or a damaged one.
     """
     if kind not in nets.KINDS:
         raise RefuError(f"no kind of postures {printable(kind)}: wanted {' or '.join(nets.KINDS)}")

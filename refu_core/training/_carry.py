@@ -140,12 +140,8 @@ def carry_over(
     """Makes a garment's networks from those of a related one and few samples; writes `output`/basis and all modes.
 
     Fifty samples are enough to be useful. `like` is the name of the related garment, one whose networks ship. All else,
-    and what is returned, is as in `pretrain`.
-
-    Raises:
-        RefuError: the set is of another garment or body, or too small.
-        GarmentError: there is no such related garment.
-        WeightsError: no networks of the related garment ship, or `output` can't be written.
+    and what is returned, is as in `pretrain`. Raises `RefuError` for a set of another garment or body, or a too small
+    one, `GarmentError` for no such related garment, and `WeightsError` where no networks of it ship.
     """
     settings, output = settings or CarrySettings(), Path(output)
     nets.require_basis(output, None, written=[f"tailornet-{mode}" for mode in SdfMode])

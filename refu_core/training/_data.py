@@ -168,8 +168,7 @@ class TrainingSet:
         """How many pairs of the plan have many poses each. Raises `RefuError` for a card without a valid number."""
         found = self.rows.card["plan"].get("pivots", SamplePlan.pivots)
         if not isinstance(found, int) or found < 1:
-            msg = f"wanted a set whose card says in plan.pivots how many pairs have many poses, got {str(found)[:80]}"
-            raise RefuError(msg)
+            raise RefuError(f"wanted the number of its pivots in the set's card (plan.pivots), got {str(found)[:80]}")
         return found
 
     @property
@@ -218,8 +217,7 @@ def read_samples(
     check_set(dataset, body, garment)
     rows = np.flatnonzero(dataset.train if split == "train" else dataset.test)
     if not len(rows):
-        msg = f"the set of {garment.name} has no finished sample to {split} on: finish it, or make a larger one"
-        raise RefuError(msg)
+        raise RefuError(f"the set of {garment.name} has no finished sample to {split} on: finish it, or enlarge it")
     if isinstance(dataset, GarmentSequences):
         stored = _frames(dataset, rows)
     else:
@@ -315,8 +313,7 @@ def check_set(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garmen
     ):
         if wanted not in of_set:
             got = dataset.card.get(what)
-            msg = f"wanted a set whose {what} is {wanted}, got {got}: simulate one with `refu simulate {garment.name}`"
-            raise RefuError(msg)
+            raise RefuError(f"wanted a set whose {what} is {wanted}, got {got}: refu simulate {garment.name} makes one")
 
 
 @torch.no_grad()

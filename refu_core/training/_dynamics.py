@@ -65,28 +65,19 @@ def train_dynamics(
 ) -> dict[str, Any]:
     """Trains what moving cloth does beyond the garment's tailornet in `folder`, and writes `folder`/dynamics.
 
-    If interrupted, the same call goes on from the last checkpoint.
+    All else, and what is returned, is as in `pretrain`; figures stand beside those of the tailornet alone. Raises
+    `RefuError` as that does, and for a set that isn't of sequences; `WeightsError` for no tailornet there, or a damaged
+    one.
 
     Args:
         dataset: simulated sequences (`refu simulate --sequences`).
         folder: holds tailornet-<mode> and its basis, which are left as they are.
         mode: mode of the tailornet; modes that share one share the dynamics, too.
-        settings: the default ones if not given.
-        garment, body, device, quiet: as in `pretrain`.
-
-    Returns:
-        The card: what was trained on what, and its figures on test sequences, beside those of the tailornet alone.
-
-    Raises:
-        RefuError: the set isn't of sequences, is of another garment or body, has no test split or too few sequences, or
-            a checkpoint there is of another training.
-        WeightsError: no tailornet there, or a damaged one.
     """
     opened = data.TrainingSet.of(garment, dataset, body)
     template, body, rows, folder = opened.garment, opened.body, opened.rows, Path(folder)
     if not isinstance(rows, GarmentSequences):
-        msg = f"dynamics are learnt from sequences, got samples at rest: refu simulate {template.name} --sequences"
-        raise RefuError(msg)
+        raise RefuError(f"dynamics need sequences, got samples at rest: refu simulate {template.name} --sequences")
     test = data.read_samples(rows, body, template, split="test")  # a missing test split is reported before any work
     still, card_of_still = opened.tailornet(folder, mode)
     settings = settings or DynamicsSettings()

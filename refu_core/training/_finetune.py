@@ -88,26 +88,17 @@ def finetune(
     device: str = "cpu",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Trains a backbone together with ReFU and writes `output`/<backbone>-<mode>.
+    """Trains a backbone together with ReFU and writes `output`/<backbone>-<mode>; returns the card.
 
-    If interrupted, the same call goes on from the last checkpoint. Under `torchrun` all processes share one training.
+    All else is as in `pretrain`. Raises as that does, `RefuError` for no such mode, and `WeightsError` for weights that
+    are missing, damaged or of another garment.
 
     Args:
         weights: folder with <backbone>-none and its basis, as `pretrain` wrote them; None to train from scratch, as the
             supplement does with the gcnn.
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves; may be `weights`.
         mode: one of `FINETUNE_MODES`.
-        backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`, of ReFU and of a backbone from scratch.
-        garment, dataset, settings, body, device, quiet: as in `pretrain`.
-
-    Returns:
-        The card: what was trained on what.
-
-    Raises:
-        RefuError: no such mode, the set is of another garment or body or too small, or a checkpoint there is of another
-            training.
-        WeightsError: no such backbone or preset, weights that are missing, damaged or of another garment.
     """
     if mode not in _MODES:
         raise RefuError(f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}")

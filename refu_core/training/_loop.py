@@ -154,8 +154,7 @@ class Loop:
                     mean_loss /= world
                 train_loss = float(mean_loss)
                 if not math.isfinite(train_loss):
-                    msg = f"the loss of {stage.name} is {train_loss} at step {step}: try a smaller learning rate"
-                    raise RefuError(msg)
+                    raise RefuError(f"the loss of {stage.name} is {train_loss} at step {step}: lower the learning rate")
                 held_out = self._validate(stage)
                 since = 0 if held_out is None else since + 1
                 if held_out is not None and held_out < best:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from refu_core import backbones as nets
-from refu_core._files import replacing
+from refu_core._files import write_file
 from refu_core.body import JOINT_NAMES, SmplBody
 from refu_core.errors import RefuError, WeightsError
 from refu_core.frames import N_JOINTS
@@ -89,7 +89,8 @@ def pretrain(
     """Trains the backbone of one garment and writes `output`/basis and `output`/<backbone>-<mode>.
 
     A basis that is there already is used, so that all backbones and modes in a folder share it. If interrupted, the
-    same call goes on from the last checkpoint. Under `torchrun` all processes share one training.
+    same call goes on from the last checkpoint. Under `torchrun` all processes share one training. Returns the card:
+    what was trained on what, and its figures on the test split.
 
     Args:
         garment: name of a built-in garment, or a template.
@@ -106,9 +107,6 @@ def pretrain(
         body: the body that the set was simulated on; the garment's built-in one if not given.
         device: `cpu` or `cuda`.
         quiet: show no progress.
-
-    Returns:
-        The card: what was trained on what, and its figures on the test split.
 
     Raises:
         RefuError: the set is of another garment or body or too small, or a checkpoint there is of another training.
@@ -195,15 +193,8 @@ def bring_basis(source: Path, target: Path, *, written: str) -> None:
     basis = load_weights(source / "basis")
     nets.require_basis(target, str(basis.card["sha256"]), written=(written,))
     for name in ("basis.safetensors", "basis.json"):
-        there = target / name
-        try:
-            if there.exists() and there.samefile(source / name):
-                continue
-            target.mkdir(parents=True, exist_ok=True)
-            with replacing(there, sync=True) as file:
-                file.write((source / name).read_bytes())
-        except OSError as error:
-            raise WeightsError(f"{there}: can't be written: {error.strerror or error}") from error
+        if not (target / name).exists() or not (target / name).samefile(source / name):
+            write_file(target / name, (source / name).read_bytes(), error=WeightsError)
 
 
 def pivots_of(samples: data.TrainingSamples, n_pivots: int) -> Tensor:
@@ -270,8 +261,7 @@ def tell_of(model: nets.Network, joints: Sequence[int], pose: Tensor) -> None:
     config, before = model.config, model.features.size
     others = [joint for joint in range(1, N_JOINTS) if joint not in config.joints]
     if config.encoding != "matrix":
-        msg = f"a network that sees the pose as {config.encoding} can't be told of further joints: train a new one"
-        raise RefuError(msg)
+        raise RefuError(f"a network that sees poses as {config.encoding} takes no further joints: train a new one")
     if len(set(joints)) < len(joints) or not set(joints) <= set(others):
         msg = f"wanted joints that the network isn't told of, each once ({', '.join(JOINT_NAMES[j] for j in others)}), "
         msg += f"got {', '.join(JOINT_NAMES[j] if 0 <= j < N_JOINTS else str(j) for j in joints)}"

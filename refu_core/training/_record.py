@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from refu_core._files import MAX_JSON_BYTES, open_file, parse_json, read_file, replacing
+from refu_core._files import MAX_JSON_BYTES, open_file, parse_json, read_file, replacing, write_file
 from refu_core.errors import RefuError, WeightsError
 
 _MAX_BYTES = 16 << 30
@@ -22,27 +22,17 @@ _MAX_BYTES = 16 << 30
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
-    """Writes tensors and plain values; the file is never half written.
-
-    Raises `WeightsError`: the disk can't be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # Through memory: on a full disk torch's own writer raises errors of its own instead of `OSError`.
-        buffer = io.BytesIO()
-        torch.save(dict(state), buffer)
-        with replacing(path, sync=True) as file:
-            file.write(buffer.getbuffer())
-    except OSError as error:
-        raise WeightsError(f"{path}: the checkpoint can't be written: {error}") from error
+    """Writes tensors and plain values; the file is never half written. Raises `WeightsError` if it can't be written."""
+    # Through memory: on a full disk torch's own writer raises errors of its own instead of `OSError`.
+    buffer = io.BytesIO()
+    torch.save(dict(state), buffer)
+    write_file(path, buffer.getbuffer(), error=WeightsError, what="the checkpoint")
 
 
 def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] | None:
     """What `save_checkpoint` wrote; None where there is nothing. No pickled code is run.
 
-    Raises:
-        RefuError: the state's "identity" is another one: the checkpoint is of another training.
-        WeightsError: the file is damaged.
+    Raises `RefuError` for another "identity" in the state, of another training, and `WeightsError` for a damaged file.
     """
     if not os.path.lexists(path):
         return None
@@ -51,8 +41,7 @@ def load_checkpoint(path: Path, identity: str | None = None) -> dict[str, Any] |
     except Exception as error:  # torch raises whatever its readers do
         raise WeightsError(f"{path}: a damaged checkpoint; delete it to start anew: {error}") from error
     if not isinstance(state, dict):
-        msg = f"{path}: a checkpoint holds a dictionary, this one a {type(state).__name__}; delete it to start anew"
-        raise WeightsError(msg)
+        raise WeightsError(f"{path}: a {type(state).__name__}, wanted a checkpoint; delete it to start anew")
     if identity is not None and state.get("identity") != identity:
         raise RefuError(f"{path}: of a training with other settings or data; delete it to start anew")
     return state

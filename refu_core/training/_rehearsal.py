@@ -42,14 +42,12 @@ class Rehearsal:
         given = plans_of(card, known=known)
         plans = [SamplePlan(**{key: value for key, value in one.items() if key in names}) for one in given]
         if not plans or not all(str(card["garment"]) in names_of(plan.garment).split("+") for plan in plans):
-            msg = "nothing to rehearse: the weights' card doesn't say what plan of their garment they were trained on"
-            raise RefuError(msg)
+            raise RefuError("nothing to rehearse: the weights' card has no plan of their garment")
         clips: Sequence[Clip] = []
         recorded = max(plan.recorded_share for plan in plans)
         if recorded > 0:
             if self.motions is None:
-                msg = f"up to {recorded:.0%} of what is to be rehearsed are recorded poses: give those motions"
-                raise RefuError(msg)
+                raise RefuError(f"up to {recorded:.0%} of what is to be rehearsed are recorded poses: give them")
             all_clips = load_clips(self.motions) if isinstance(self.motions, (str, Path)) else self.motions
             clips = split_clips(all_clips)[0]
         ends = np.cumsum([plan.count - plan.n_test for plan in plans])

@@ -62,8 +62,7 @@ class SdfSettings:
     def __post_init__(self) -> None:
         """Raises `RefuError` for an unknown preset and for invalid numbers."""
         if self.preset not in SDF_PRESETS:
-            msg = f"no preset {self.preset!r} of the distance network: wanted one of {', '.join(SDF_PRESETS)}"
-            raise RefuError(msg)
+            raise RefuError(f"no preset {self.preset!r} of the distance network: wanted {', '.join(SDF_PRESETS)}")
         if min(self.steps, self.batch_size, self.check_every) < 1 or self.points < 8 or not self.learning_rate > 0:
             raise RefuError(f"steps, batch_size, points (8 or more) and rates must be positive, got {asdict(self)}")
 
@@ -191,14 +190,11 @@ def train_sdf(
 
     If interrupted, it goes on from the last checkpoint and ends with the same weights: what is drawn for a step depends
     only on the seed and the number of the step. Under `torchrun` every process takes its share of the bodies. On a GPU
-    it computes in bfloat16, with weights in float32.
+    it computes in bfloat16, with weights in float32. Returns the card: settings and figures, on held-out pairs of the
+    training split and on the test split.
 
-    Returns the card: settings and figures, on held-out pairs of the training split and on the test split.
-
-    Raises:
-        RefuError: a set of another garment or body, a checkpoint of another training, a split without samples, or a
-            loss that isn't finite.
-        WeightsError: a damaged checkpoint, or a disk that can't be written.
+    Raises `RefuError` for a set of another garment or body, a checkpoint of another training, a split without samples,
+    or a loss that isn't finite; `WeightsError` for a damaged checkpoint, or a disk that can't be written.
     """
     check_set(dataset, body, garment)
     settings = settings or SdfSettings()

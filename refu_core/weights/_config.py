@@ -45,8 +45,7 @@ def config_of_card(kind: type[Config], values: Any) -> Config:
     given = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
     for field in fields(kind):
         if field.name in given and not _fits(field, given[field.name]):
-            msg = f"{field.name} of {kind.__name__} can't be {str(given[field.name])[:80]}: train it again"
-            raise WeightsError(msg)
+            raise WeightsError(f"{field.name} of {kind.__name__} can't be {given[field.name]!s:.80}: train it again")
     try:
         return kind(**given)
     except TypeError as error:

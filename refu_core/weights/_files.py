@@ -22,11 +22,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from refu_core._files import InputFile, open_file, parse_json, replacing
+from refu_core._files import InputFile, open_file, parse_json, write_file
 from refu_core._npz import DAMAGE
 from refu_core._versions import versions
 from refu_core.errors import WeightsError, require_type
-from refu_core.weights._steps import in_steps
 
 FORMAT = "refu-weights-1"
 MAX_BYTES = 3 << 30
@@ -39,6 +38,7 @@ _DTYPES = {
     *(torch.int64, torch.int32, torch.int8, torch.bool),
 }
 _PIECE = 1 << 22
+_STEPS = 127
 _STEP = ".step"
 """Follows the name of a tensor in bytes in the name of another one: the size of a step, or of those of its rows."""
 
@@ -54,6 +54,18 @@ class Weights:
     """File of the tensors."""
     files: tuple[Path, ...]
     """All files of tensors that were read: that of the base, if there is one, and then its own."""
+
+
+def in_steps(values: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
+    """The steps, int8, of float32 `values`, and a step's size: a number, or with `dim` one for each row along that.
+
+    Sizes are rounded to bfloat16. 127 steps then have few enough digits for float32, so the largest of the values that
+    are read tells what the step was: stored again, they are the same to the bit.
+    """
+    largest = values.abs().amax() if dim is None else values.abs().amax(dim, keepdim=True)
+    step = (largest / _STEPS).bfloat16().float()
+    steps = (values / step.clamp_min(torch.finfo().tiny)).round().clamp(-_STEPS, _STEPS)
+    return steps.to(torch.int8), step
 
 
 def weights_folder(garment: str, root: str | os.PathLike[str] | None = None) -> Path:
@@ -98,14 +110,8 @@ def save_weights(
     digest = hashlib.sha256(data).hexdigest()
     full = {"format": FORMAT, **card, **differs, "sha256": digest, "versions": versions("torch")}
     path = Path(f"{stem}.safetensors")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path, sync=True) as file:
-            file.write(data)
-        with replacing(Path(f"{stem}.json"), sync=True) as file:
-            file.write((json.dumps(full, indent=1) + "\n").encode())
-    except OSError as error:
-        raise WeightsError(f"{stem}: weights can't be written: {error}") from error
+    write_file(path, data, error=WeightsError)
+    write_file(Path(f"{stem}.json"), (json.dumps(full, indent=1) + "\n").encode(), error=WeightsError)
     return path
 
 

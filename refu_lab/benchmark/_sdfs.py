@@ -202,8 +202,7 @@ def read_stretches(motions: Path | None, bags: Path, *, count: int, length: int)
     starts = [(clip, start) for clip in _clips(motions, bags) for start in range(0, len(clip) - length + 1, length)]
     if not starts:
         where, wanted = (bags, "the repository's bags") if motions is None else (motions, "AMASS-style .npz files")
-        msg = f"{where}: no motion of {length} frames at 30 Hz in it, wanted {wanted}; name a folder with --motions"
-        raise RefuError(msg)
+        raise RefuError(f"{where}: no motion of {length} frames at 30 Hz in it, wanted {wanted} (--motions DIR)")
     picked = [starts[(2 * i + 1) * len(starts) // (2 * count)] for i in range(count)]
     return [clip[start : start + length] for clip, start in picked]
 

@@ -58,8 +58,7 @@ def names(text: str) -> tuple[str, ...]:
     """Parses `A,B`: at least one name; spaces are only in paths of garments."""
     found = tuple(name.strip() for name in text.split(",") if name.strip())
     if not found or any(len(name.split()) > 1 and not name.endswith(".npz") for name in found):
-        msg = f"wanted one name or several with commas between them, got {printable(repr(text))}"
-        raise argparse.ArgumentTypeError(msg)
+        raise argparse.ArgumentTypeError(f"wanted names with commas between them, got {printable(repr(text))}")
     return found
 
 
@@ -125,8 +124,7 @@ def _output(wanted: str, *kinds: Callable[[int], bool]) -> Callable[[str], Path]
         except OSError as error:
             raise argparse.ArgumentTypeError(f"{printable(text)} can't be written: {error.strerror}") from error
         if not is_right or not found.name:
-            msg = f"wanted {wanted} to write, or a new one; {printable(text)} is something else"
-            raise argparse.ArgumentTypeError(msg)
+            raise argparse.ArgumentTypeError(f"wanted {wanted} to write, or a new one, not {printable(text)}")
         return found
 
     return parse
@@ -257,8 +255,7 @@ def given(args: argparse.Namespace, options: type) -> dict[str, Any]:
     known = {field.name for field in fields(options)}
     named = {name: value for name, value in vars(args).items() if name in known and value is not None}
     if "betas" in named and named.setdefault("betas_source", BetasSource.FIXED) != BetasSource.FIXED:
-        msg = f"--betas is everybody's shape, whatever arrives: leave it or --betas-source {named['betas_source']} out"
-        raise RefuError(msg)
+        raise RefuError(f"--betas is everybody's shape: leave it or --betas-source {named['betas_source']} out")
     return {name: tuple(value) if isinstance(value, list) else value for name, value in named.items()}
 
 

@@ -78,8 +78,7 @@ class BenchmarkOptions:
         if self.device not in (None, "cpu", "cuda"):
             raise RefuError(f"no device {self.device!r}: wanted cpu or cuda")
         if self.weights is not None and not self.weights.is_dir():
-            msg = f"{self.weights}: not a folder; wanted one with a folder a garment, as refu train writes them"
-            raise RefuError(msg)
+            raise RefuError(f"{self.weights}: not a folder; wanted one with a folder a garment, as of refu train")
 
     @property
     def worn(self) -> tuple[str, ...]:

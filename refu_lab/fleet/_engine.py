@@ -164,13 +164,11 @@ class DaskEngine:
         try:
             return future.result()  # if its worker has died since, the task is run again
         except (CancelledError, CommClosedError) as error:
-            msg = "the Dask scheduler is gone; what is finished is kept: give the same command again to go on"
-            raise FleetError(msg) from error
+            raise FleetError("the Dask scheduler is gone, what is done is kept: give the same command again") from error
         except KilledWorker:
             return Lost("one worker after another died with it (out of memory?)")
         except ImportError as error:
-            msg = f"the workers can't import {error.name}: install refu-ros {__version__} where they run"
-            raise FleetError(msg) from error
+            raise FleetError(f"the workers can't import {error.name}: install refu-ros {__version__} there") from error
 
 
 _made: dict[str, Callable[[Any], Any]] = {}

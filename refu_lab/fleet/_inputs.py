@@ -58,8 +58,7 @@ def find_recordings(inputs: Sequence[str], *, results: Sequence[str | None] = ()
         found = [source for source in _find(text) if not written or not f"{_whole(source)}/".startswith(written)]
         if not found:
             where = " beside the results" if written else ""
-            msg = f"{text}: no recording there{where}; wanted bags or motions ({', '.join(SUFFIXES)}, rosbag2 folders)"
-            raise RefuError(msg)
+            raise RefuError(f"{text}: no recording there{where}; wanted {', '.join(SUFFIXES)} or rosbag2 folders")
         for source in found:
             sources.setdefault(source if is_url(source) else str(_place(source)), source)
     return list(_named(sources.values()))

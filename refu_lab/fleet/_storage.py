@@ -146,7 +146,7 @@ class Folder:
         with contextlib.ExitStack() as stack:
             with self._errors():
                 folder.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(exclusive(folder / ".lock", error=RefuError(msg), is_kept=False))
+                stack.enter_context(exclusive(folder / ".lock", error=RefuError(msg)))
             try:
                 yield
             finally:

@@ -12,7 +12,7 @@ from refu_core.metrics import Figures
 from refu_core.simulation import POSTURES
 from refu_lab.reproduction._methods import SEQUENCE_SHAPES
 from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, Study
-from refu_lab.reproduction._tables import ALL, Missing, ResultTable, weighted
+from refu_lab.reproduction._tables import ALL, MAIN_METRICS, Missing, ResultTable, weighted
 
 ENERGY_ZOOM = 2.5e-3
 """Upper end of the paper's zoomed histogram [m²]."""
@@ -20,15 +20,12 @@ UNSEEN_GROUPS = 5
 """Number of groups of equally many samples, by distance to the training set."""
 
 Values = Mapping[str, float | None]
-_MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
 
 
 @dataclass(frozen=True)
 class SampleTable:
-    title: str
-    about: str
     methods: tuple[str, ...]
-    metrics: tuple[str, ...] = _MAIN
+    metrics: tuple[str, ...] = MAIN_METRICS
     """Metrics that a method without a run has, too, as None."""
     values: Callable[[MethodRun], Values] | None = None
     """Gives a run's values by metric; by default those are the fields of `Figures`."""
@@ -43,8 +40,7 @@ class SampleTable:
 
 def sample_table(study: Study, name: str) -> ResultTable:
     """A table of `SAMPLE_TABLES`, garment by garment and, if there are several, over all of them."""
-    spec = SAMPLE_TABLES[name]
-    table = ResultTable(name, spec.title, spec.about)
+    spec, table = SAMPLE_TABLES[name], ResultTable.of(name)
     for garment, method in itertools.product(study.n_samples, spec.methods):
         table.add(garment, method, spec.of(study.runs.get((garment, method))))
     if spec.is_summed:
@@ -83,13 +79,7 @@ def _missing_postures(study: Study) -> Iterator[Missing]:
 
 def posture_table(study: Study) -> ResultTable:
     """The node in each everyday posture, garment by garment and over all of them."""
-    table = ResultTable(
-        "postures",
-        "Everyday postures",
-        "The node, hybrid, in the postures that a set was asked for (`posture_share`), each as other people would hold "
-        "it: arms on the body, overhead, crossed, sitting, kneeling, on all fours. MPVE beside that of all these "
-        "samples says in which of them the networks are at a loss.",
-    )
+    table = ResultTable.of("postures")
     table.missing = [*_missing_of(study, POSTURE_METHODS), *_missing_postures(study)]
     found = {garment: [study.runs.get((garment, name)) for name in POSTURE_METHODS] for garment in study.n_samples}
     if len(found) > 1:
@@ -116,14 +106,7 @@ def posture_table(study: Study) -> ResultTable:
 
 def time_table(study: Study) -> ResultTable:
     """The supplement's run times, by component and garment."""
-    table = ResultTable(
-        "time",
-        "Run time by component",
-        "Median wall time of one garment in one frame on one thread of the CPU that this ran on; of the signed "
-        "distances, taking over the pose and asking for all vertices. The paper's are of a GPU, but for its accurate "
-        "distance and its optimisation. The optimisation includes its distances.",
-        labels={name: label for name, (label, *_) in _COMPONENTS.items()},
-    )
+    table = ResultTable.of("time", labels={name: label for name, (label, *_) in _COMPONENTS.items()})
     for garment, (name, (_, method, *parts)) in itertools.product(study.n_samples, _COMPONENTS.items()):
         run = study.runs.get((garment, method))
         table.add(garment, name, {"ms": None if run is None else run.median_ms(*parts)})
@@ -150,7 +133,7 @@ def _add_trends(table: ResultTable) -> None:
 
 def _alpha_values(run: MethodRun) -> Values:
     """The main figures and, for ReFU, its mean α by how wrong its distance is."""
-    values = {metric: getattr(run.figures, metric) for metric in _MAIN}
+    values = {metric: getattr(run.figures, metric) for metric in MAIN_METRICS}
     groups = zip(itertools.pairwise(RATIO_EDGES), *run.scales, strict=True)
     for (low, high), count, total in groups if run.method == "refu-approx" else ():
         if count:
@@ -193,33 +176,20 @@ _OPTIMISATIONS = (
 
 SAMPLE_TABLES: Mapping[str, SampleTable] = {
     "parts": SampleTable(
-        "What each part contributes",
-        "The networks that ship, and one part of the way to the node more in each row: the paper's layer, as it is "
-        "(ReFU without blending and margin), the margin, blending, and all that the node does. No other networks "
-        "are needed.",
         (
             *("skinned", "tailornet", "naive-approx"),
             *(f"refu-hybrid{kind}" for kind in ("-bare", "-unblended", "")),
             *("node-hybrid", "node-accurate", "node-skinned"),
-        ),
+        )
     ),
     "comparison": SampleTable(
-        "Comparison: ways to handle collisions",
-        "Test samples of each garment's set, each way of collision handling with the approximate and the "
-        'accurate signed distance of the body, as in the paper\'s Table 2. The rows "the node" are what `garment_node` '
-        "and `refu replay` publish: ReFU and a second look at what it moved.",
         (
             *("skinned", "tailornet", "naive-approx", "naive-accurate", *_OPTIMISATIONS),
             *("collision-loss-approx", "collision-loss-accurate", *(f"refu-{mode}" for mode in _MODES)),
             *("node-skinned", *(f"node-{mode}" for mode in _MODES)),
-        ),
+        )
     ),
     "ablation": SampleTable(
-        "Ablation: predicted scale, margin, blending",
-        "α fixed at 1 against α predicted, each trained so. Ours has two things that the paper's layer lacks: a "
-        "margin (a vertex is pushed to ε from the skin instead of onto it) and blending (a push takes its "
-        'neighbourhood along). The rows "not blended" and "ε = 0" leave them out at run time, without training anew; '
-        "with neither, it is exactly the paper's layer, which is also shown trained that way.",
         (
             "tailornet",
             *(f"fixed-bare-{sdf}" for sdf in _SDFS),
@@ -227,26 +197,11 @@ SAMPLE_TABLES: Mapping[str, SampleTable] = {
             *(f"fixed-{sdf}{kind}" for kind in ("-bare", "-unblended", "") for sdf in _SDFS),
             *(f"refu-{mode}{kind}" for kind in ("-bare", "-unblended", "") for mode in _MODES),
         ),
-        (*_MAIN, "avg_vf", "avg_ee"),
+        (*MAIN_METRICS, "avg_vf", "avg_ee"),
     ),
-    "alpha": SampleTable(
-        "Networks that predict the scale α",
-        "Alt. 1: one latent vector for all vertices, as many weights. Alt. 2: from the vertex's distance alone. "
-        "ReFU: a latent vector for each vertex. All with the approximate distance.",
-        ("tailornet", "alt1-approx", "alt2-approx", "refu-approx"),
-        values=_alpha_values,
-    ),
-    "gcnn": SampleTable(
-        "Graph convolution as the backbone, trained from scratch",
-        "The same graph convolution network with and without ReFU in it, from scratch. The paper doesn't say for "
-        "which garment its figures are; they stand beside each of ours.",
-        ("gcnn", *(f"gcnn-refu-{mode}" for mode in _MODES)),
-    ),
+    "alpha": SampleTable(("tailornet", "alt1-approx", "alt2-approx", "refu-approx"), values=_alpha_values),
+    "gcnn": SampleTable(("gcnn", *(f"gcnn-refu-{mode}" for mode in _MODES))),
     "laplacian": SampleTable(
-        "Local Laplacian error where collisions were resolved",
-        "Mean length of the difference between a vertex's uniform Laplacian on its 1-ring and the true one, over "
-        "the vertices that are inside the body in what the backbone alone predicts: the same vertices for every method "
-        "of that backbone.",
         (
             *("tailornet", "skinned-naive", "skinned-optimisation", *_OPTIMISATIONS),
             *(f"refu-{mode}" for mode in _MODES),
@@ -255,30 +210,18 @@ SAMPLE_TABLES: Mapping[str, SampleTable] = {
         ("laplacian_mm", "mpve_mm"),
     ),
     "unseen": SampleTable(
-        "Collision error far from the training set",
-        "Mean collision error Σ max(0, -f) [mm] of test samples in groups of equal size, by their distance to the "
-        "nearest training sample in (θ, β, γ). The paper prints no figures, only a plot.",
         ("tailornet", "collision-loss-approx", "collision-loss-accurate", "refu-approx", "refu-hybrid"),
         metrics=(),
         values=_unseen_values,
         is_summed=False,
     ),
     "energy": SampleTable(
-        "Penetration energy",
-        "E = Σ max(0, -f)² over a garment's vertices, with the exact distance f. The paper takes its energy from "
-        "another work without giving the formula; this one is ours, so only the shape of the histograms compares.",
         ("skinned", "tailornet", *(f"refu-{mode}" for mode in _MODES)),
         metrics=("mean_energy", "median_energy", "zero_energy_percent", "low_energy_percent"),
         values=_energy_values,
         is_summed=False,
     ),
-    "sequence": SampleTable(
-        "Continuous motion with a perceptron",
-        "Every frame of test sequences with motions of their own: simulated with dynamics, where the networks see the "
-        "pose of that frame alone. The paper's figures are of another data set (VTO).",
-        ("mlp-5", "mlp-5-refu-approx", "mlp-17", "mlp-17-refu-approx"),
-        is_summed=False,
-    ),
+    "sequence": SampleTable(("mlp-5", "mlp-5-refu-approx", "mlp-17", "mlp-17-refu-approx"), is_summed=False),
 }
 """The tables over test samples, without those of postures and times."""
 

@@ -42,10 +42,7 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     """Makes and writes the tables that were asked for.
 
     `engine` runs the methods, a block of samples a task; this process alone makes the tables sdf, time and motion.
-
-    Raises:
-        RefuError: there is nothing to make them from, a data set or motion can't be read, or the results can't be
-        written.
+    Raises `RefuError`: nothing to make them from, an input that can't be read, or results that can't be written.
     """
     if not options.data and (options.table not in ("all", "motion") or options.motions is None):
         need = "--motions DIR" if options.table == "motion" else "--data DIR"

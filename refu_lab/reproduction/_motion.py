@@ -37,18 +37,6 @@ _BIN = 1e-5  # [m]; resolution of the percentiles of the skin's shift
 _LONGEST_WAY = 0.2  # [m]
 _STRETCHED = 2.0
 _SKIN = "skin"
-_ABOUT = (
-    "Recorded motion has no ground truth: what is measured is how free of the body garments are, how calm, and how "
-    "sound their cloth. Every frame and every vertex counts. Every other person has a body shape of their own: "
-    f"ten betas, drawn evenly from within ±{SPREAD:g}. The collider is the posed body with its overlaps pulled "
-    "apart, which garments are brought off; the skin runs through itself where limbs meet, so no garment can be free "
-    "of it there. *Collider cut* counts frames in which the collider runs through itself within "
-    f"{1e3 * NEAR:g} mm of the garment where the rest pose doesn't. *Jumps* are of the vertex that goes farthest in "
-    f"1/{_RATE:g} s against the garment skinned to the same motion. A hem that hangs still while a leg swings below it "
-    "jumps by that, too; *leaps* are how much farther a vertex goes than the skinned one does. *Layers cut* counts "
-    "frames in which T-shirt and short pants, worn together, cut through each other. *Crossings* are pairs of a "
-    "garment's own faces that intersect, a frame."
-)
 
 
 def motion_table(clips: Mapping[str, Motion], *, library: Library, every: int, progress: bool = False) -> ResultTable:
@@ -57,7 +45,7 @@ def motion_table(clips: Mapping[str, Motion], *, library: Library, every: int, p
     `clips` are recorded motions by name; one frame in `every` so many is dressed and judged.
     """
     labels = {name: METHODS[name].label for name in MOTION_METHODS} | {_SKIN: "skin to collider"}
-    table = ResultTable("motion", "Recorded motion", _ABOUT, labels=labels)
+    table = ResultTable.of("motion", labels=labels, spread=SPREAD, near_mm=1e3 * NEAR, rate=_RATE)
     indices = {name: range(0, len(clip) - _step(clip), every) for name, clip in clips.items()}
     n_pairs = sum(map(len, indices.values()))
     shapes = drawn_shapes(n_pairs)

@@ -63,16 +63,7 @@ def sdf_table(sets: Sequence[SampleSet], *, library: Library, progress: bool = F
     for name in _NAMES:
         labels[name + _CLOSE] = "the same, points within 2 cm of the skin"
         labels |= {f"{name}, {pose}": f"the same, {pose}, points within 2 cm of the skin" for pose in FOLDED_POSES}
-    table = ResultTable(
-        "sdf",
-        "Errors of the approximate signed distance",
-        f"At the vertices of the simulated garments, half of them disturbed by {1e3 * DISTURBANCE:g} mm (Gaussian, "
-        "each axis): the second of the paper's three kinds of samples, and the points that ReFU asks for. The paper's "
-        "figures are over all three kinds, of its network. The relative error leaves out points within 0.1 mm of the "
-        f"skin. Squat, crossed arms and hands on hips are those poses of {_FOLDED_SHAPES} of the bodies, with the "
-        "garment as it follows the skin: there limbs press on each other, and the collider is pulled apart.",
-        labels=labels,
-    )
+    table = ResultTable.of("sdf", labels=labels, disturbance_mm=1e3 * DISTURBANCE, shapes=_FOLDED_SHAPES)
     for samples in sets:
         garment = samples.garment
         setup = GarmentSetup(garment, library)

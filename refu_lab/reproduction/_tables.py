@@ -25,8 +25,16 @@ _PAPER_NOTE = (
 )
 
 
-_MAIN = ("mpve_mm", "vfcp_percent", "cfmp_percent")
-_PRINTED = json.loads(Path(__file__).with_name("paper.json").read_text(encoding="utf-8"))
+def _beside(name: str) -> str:
+    """The text of a file in this folder."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+MAIN_METRICS = ("mpve_mm", "vfcp_percent", "cfmp_percent")
+_TEXTS = [part.partition("\n") for part in _beside("tables.md").removeprefix("# ").split("\n# ")]
+_ABOUT = {head.partition(": ")[0]: (head.partition(": ")[2], " ".join(text.split())) for head, _, text in _TEXTS}
+"""Title of each table, and what was measured and how, as Markdown."""
+_PRINTED = json.loads(_beside("paper.json"))
 """By table: the methods, and their values by garment (empty if the supplement doesn't name it) and metric."""
 
 PAPER: Mapping[tuple[str, str, str, str], float] = {
@@ -57,7 +65,7 @@ def published_modes() -> dict[str, dict[str, float]]:
     found = {}
     for mode, sdf in (("approx", "sdf-approx"), ("hybrid", "sdf-approx"), ("accurate", "sdf-accurate")):
         ms = sum(PAPER["time", "all", component, "ms"] for component in ("backbone", sdf, "refu"))
-        found[mode] = {"ms": ms} | {metric: PAPER["comparison", "all", f"refu-{mode}", metric] for metric in _MAIN}
+        found[mode] = {"ms": ms} | {m: PAPER["comparison", "all", f"refu-{mode}", m] for m in MAIN_METRICS}
     return found
 
 
@@ -146,6 +154,12 @@ class ResultTable:
     """(file name, caption)."""
     labels: Mapping[str, str] = field(default_factory=dict)
     """Readable names of rows that aren't methods."""
+
+    @classmethod
+    def of(cls, name: str, *, labels: Mapping[str, str] | None = None, **numbers: float) -> ResultTable:
+        """An empty table with its texts of `tables.md`; `numbers` are those that they name."""
+        title, about = _ABOUT[name]
+        return cls(name, title, about.format(**numbers), labels=labels or {})
 
     def add(self, garment: str, method: str, values: Mapping[str, float | None]) -> None:
         """Adds rows: a method's values by metric, each beside the paper's."""

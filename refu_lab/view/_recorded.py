@@ -170,8 +170,7 @@ class RecordedFilm:
         while moments and not moments[0][1]:
             moments.pop(0)
         if not moments:
-            msg = f"{path}: nothing to show: no marker of triangles; --dress dresses people whose motion is in it"
-            raise RefuError(msg)
+            raise RefuError(f"{path}: nothing to show: no marker of triangles; --dress dresses who moves in it")
         self._frames = [shown for _, shown in moments]
         steps = 1e-9 * np.diff([log_time_ns for log_time_ns, _ in moments])
         self.times = np.append(0.0, np.cumsum(np.clip(steps, 0.0, _LONGEST_PAUSE_S)))
