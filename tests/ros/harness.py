@@ -45,7 +45,7 @@ PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
 
-_TURN_S = 0.02
+_TURN_S = 0.004
 """How long a node in the tests' process, and then its peer, does what there is to do, until the test looks again."""
 _QUIET_S = 0.05
 """After so long without anything to do an executor has nothing left to do."""
