@@ -341,7 +341,7 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             break
         step = _larger(lift, 0.9 * (adjacent @ lift) / degree)
         v = v + step
-        asked = step.any(1)[ends].any(1)  # what stays where it is lacks what it did
+        asked = (step[ends] != 0).any((1, 2))  # what stays where it is lacks what it did
     moved = np.linalg.norm(v - start, axis=1)
     if (moved > _FARTHEST).mean() > _MOST_FAR or moved.max() > 2 * _FARTHEST:
         near = _near(v[moved > _FARTHEST], body)
