@@ -165,15 +165,17 @@ class Registrar:
             gap = at[mine] - self.surface.vertices[theirs]
             weight = _SEEN / how.noise**2 / (1 + (gap**2).sum(1) / reach**2) ** 2
             prior = np.repeat([1.0, how.angle_spread**-2, 0.0], [N_BETAS, 3 * N_JOINTS, 3])
-            rows = [
-                (np.einsum("nck,nc->nk", linear.vertices[mine], self.surface.normals[theirs]), weight),
-                (linear.vertices[mine].reshape(-1, len(state)), np.repeat(_ALONG * weight, 3)),
-                (linear.joints[_LOOKED_AT, :].reshape(-1, len(state)), how.joint_spread**-2),
-            ]
-            across, off_joints = (gap * self.surface.normals[theirs]).sum(1), (joints - self.joints)[list(_LOOKED_AT)]
-            off = [across, gap.ravel(), off_joints.ravel()]
-            normal = np.diag(prior) + sum(a.T @ (np.reshape(w, (-1, 1)) * a) for a, w in rows)
-            slope = prior * state + sum(a.T @ (w * r) for (a, w), r in zip(rows, off, strict=True))
+            out = self.surface.normals[theirs]
+            metric = weight[:, None, None] * (out[:, :, None] * out[:, None, :] + _ALONG * np.eye(3))
+            # A vertex has its own pair, and those of the target's points that are nearest to it.
+            pairs = sparse.csr_array((np.ones(len(mine)), (mine, np.arange(len(mine)))), shape=(len(at), len(mine)))
+            metrics = (pairs @ metric.reshape(-1, 9)).reshape(-1, 3, 3)
+            pull = pairs @ (metric @ gap[:, :, None])[:, :, 0]
+            moves, looked_at = (one.reshape(-1, len(state)) for one in (linear.vertices, linear.joints[_LOOKED_AT, :]))
+            off = (joints - self.joints)[list(_LOOKED_AT)].ravel() / how.joint_spread**2
+            normal = np.diag(prior) + moves.T @ (metrics @ linear.vertices).reshape(moves.shape)
+            normal += looked_at.T @ looked_at / how.joint_spread**2
+            slope = prior * state + moves.T @ pull.ravel() + looked_at.T @ off
             state = state - np.linalg.solve(normal, slope)
             at, joints = self._at(state)
         return at

@@ -327,9 +327,11 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             f"most of it near the {near}: it was made for another body or pose; say its --pose, or try --body"
             f"{no_opening(mesh.faces)}"
         )
+    ends = np.concatenate((np.arange(len(v)).repeat(2).reshape(-1, 2), edges))  # a vertex, as the middle of no edge
+    lacks, asked = np.zeros((len(ends), 3)), np.ones(len(ends), np.bool_)
     for _ in range(_ROUNDS):
-        lift = _shortfall(v, body)
-        middles = _shortfall(v[edges].mean(1), body)
+        lacks[asked] = _shortfall(v[ends[asked]].mean(1), body)
+        lift, middles = lacks[: len(v)], lacks[len(v) :]
         order = np.argsort(np.linalg.norm(middles, axis=1))
         for end in (0, 1):
             most = np.zeros_like(v)
@@ -337,7 +339,9 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             lift = _larger(lift, most)
         if np.linalg.norm(lift, axis=1).max() < 1e-4:
             break
-        v = v + _larger(lift, 0.9 * (adjacent @ lift) / degree)
+        step = _larger(lift, 0.9 * (adjacent @ lift) / degree)
+        v = v + step
+        asked = (step[ends] != 0).any((1, 2))  # what stays where it is lacks what it did
     moved = np.linalg.norm(v - start, axis=1)
     if (moved > _FARTHEST).mean() > _MOST_FAR or moved.max() > 2 * _FARTHEST:
         near = _near(v[moved > _FARTHEST], body)

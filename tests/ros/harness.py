@@ -45,7 +45,7 @@ PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
 
-_TURN_S = 0.02
+_TURN_S = 0.004
 """How long a node in the tests' process, and then its peer, does what there is to do, until the test looks again."""
 _QUIET_S = 0.05
 """After so long without anything to do an executor has nothing left to do."""
@@ -149,12 +149,14 @@ class Peer:
         """Listens no longer."""
         self.node.destroy_subscription(self._subscription)
 
-    def spin_until(self, condition: Callable[[], Any], what: str, *, timeout: float = PATIENCE_S) -> None:
+    def spin_until(
+        self, condition: Callable[[], Any], what: str, *, timeout: float = PATIENCE_S, turn: float = 0.02
+    ) -> None:
         """Fails with `what` when it doesn't come true."""
         end = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < end, f"waited {timeout} s in vain: {what}"
-            rclpy.spin_once(self.node, timeout_sec=_TURN_S)
+            rclpy.spin_once(self.node, timeout_sec=turn)
 
     def spin(self, seconds: float) -> None:
         """For so long."""
@@ -266,7 +268,7 @@ class NodeHere:
             self._executor.spin_until_future_complete(Future(), timeout_sec=_TURN_S)
             return condition()
 
-        self.peer.spin_until(both, what, **options)
+        self.peer.spin_until(both, what, turn=_TURN_S, **options)
 
     def close(self) -> None:
         """Leaves the graph; fails if something still holds the node, which the next test would meet there."""

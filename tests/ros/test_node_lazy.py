@@ -146,7 +146,7 @@ def test_rest_is_reported_and_is_no_fault(stage: Callable[..., Stage], monkeypat
     assert scene.peer.status("garments")[:2] == (0, "nobody listens")
     scene.peer.watch()
     assert scene.reports(2)[0] == 0
-    monkeypatch.setattr("refu_ros._diagnostics._FIRST_INPUT_S", 2.0)
+    monkeypatch.setattr("refu_ros._diagnostics._FIRST_INPUT_S", 0.5)
     scene.until(lambda: scene.peer.status("input")[0] == 1, "who doesn't send though somebody listens is missed")
     assert scene.peer.status("input")[2]["subscribed"] == "yes"
 
@@ -226,7 +226,10 @@ def test_the_parameter_is_heeded_while_something_else_is_recorded(stage: Callabl
         assert state.path == tmp_path / "a-1"
 
 
-def test_who_needs_the_input_watched_switches_it_off(stage: Callable[..., Stage]) -> None:
+def test_who_needs_the_input_watched_switches_it_off(
+    stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("refu_ros._diagnostics._FIRST_INPUT_S", 0.5)
     scene = stage(lazy=False)
     scene.until(lambda: scene.heard() == 1, "the node listens")
     scene.reports(3)
@@ -293,7 +296,7 @@ def test_the_guide_names_the_qualities_that_can_be_overridden() -> None:
 
 
 def test_the_program_rests_after_some_seconds(ros: None, tmp_path: Path) -> None:  # noqa: ARG001
-    soon = "from refu_ros import _listener; _listener._GRACE_S = 1.0"
+    soon = "from refu_ros import _listener; _listener._GRACE_S = 0.3"
     with NodeProcess(tmp_path / "log.txt", first=soon, **CHEAP) as node:
         peer = Peer()
         peer.wait_for_node()
