@@ -166,6 +166,7 @@ class GarmentPipeline:
         """
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
+        require_type(contact, ContactSettings, "ContactSettings")
         require_type(threads, int, "a number of threads")
         if threads < 1:
             raise RefuError(f"wanted at least one thread, got {threads}")
