@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import threading
@@ -11,6 +12,7 @@ from functools import cached_property, partial
 from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import TypeVar
+from weakref import WeakSet
 
 import torch
 
@@ -21,6 +23,8 @@ from refu_core.realtime._outputs import PipelineOutput
 
 T = TypeVar("T")
 Work = Callable[[FrameStep, Sequence[SmplFrame]], list[PipelineOutput]]
+_ENDING = threading.Event()
+"""Set once Python ends: daemon threads are then stopped before they call a pipeline."""
 _ON_GPU = threading.Lock()
 """Shared by all pipelines on a GPU: the stream that Warp works on is the device's, not the thread's."""
 
@@ -30,6 +34,7 @@ class Crew:
 
     def __init__(self, steps: Sequence[FrameStep], *, on_gpu: bool) -> None:
         self._n_steps = len(steps)
+        _CREWS.add(self)
         self._process, self._free = os.getpid(), SimpleQueue[FrameStep]()
         for step in steps:
             self._free.put(step)
@@ -37,6 +42,8 @@ class Crew:
 
     def call(self, work: Callable[[FrameStep], T]) -> T:
         """Does `work` with a step, as soon as one is free. Raises `RefuError` if none ever will be."""
+        if _ENDING.is_set() and threading.current_thread().daemon:
+            threading.Event().wait()  # for ever, as from Python 3.14 on
         try:
             return self._with_step(work, wait=os.getpid() == self._process)  # after a fork no other thread frees one
         except Empty as error:
@@ -80,3 +87,21 @@ class Crew:
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self._n_steps - 1, "dress", initializer=partial(torch.set_num_threads, 1))
+
+    def come_to_rest(self) -> None:
+        """Waits until no call is going on, for a second at most."""
+        steps: list[FrameStep] = []
+        with contextlib.suppress(Empty):
+            steps.extend(self._free.get(timeout=1.0) for _ in range(self._n_steps))
+        any(map(self._free.put, steps))
+
+
+_CREWS = WeakSet[Crew]()
+
+
+@atexit.register
+def _end() -> None:
+    """Lets daemon threads finish their frames: Python kills them as native code returns, and the process aborts."""
+    _ENDING.set()
+    for crew in [*_CREWS]:
+        crew.come_to_rest()

@@ -8,6 +8,7 @@ import math
 import os
 import pickle
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -271,6 +272,30 @@ def test_a_batch_after_a_fork_is_dressed_by_one_thread() -> None:
         signal.alarm(300)
         os._exit(0 if len(pipeline(_frames(3, seed=1))) == 3 else 1)
     assert os.waitpid(child, 0)[1] == 0
+
+
+_AT_EXIT = """
+import atexit, threading, time
+from refu_core import GarmentPipeline, SmplFrame
+pipeline = GarmentPipeline.load(["short-pant-male"], threads=2)
+frames = [SmplFrame(pose=[k / 1000] * 72) for k in range(3)]
+atexit.register(lambda: print(len(pipeline(frames)), "at exit"))
+def dress():
+    k = 0
+    while True:
+        k += 1
+        pipeline(SmplFrame(pose=[k * 1e-6] * 72))
+threading.Thread(target=dress, daemon=True).start()
+time.sleep(0.5)
+"""
+
+
+def test_a_daemon_thread_in_a_call_does_not_abort_a_program_that_ends() -> None:
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", _AT_EXIT], capture_output=True, text=True, timeout=300, check=False
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (0, "3 at exit\n", "")
 
 
 def _all_steps(pipeline: GarmentPipeline) -> list[FrameStep]:
