@@ -61,21 +61,11 @@ def suspect(i: int, state: State) -> None:
         state.reached[wp.atomic_add(state.counts, SUSPECTS, 1)] = i
 
 
-@wp.func
-def wipe(i: int, state: State) -> None:
-    """Forgets the last call, which may have been interrupted between two of its steps."""
-    state.mark[i] = 0
-    state.field[i] = wp.vec3()
-    state.smoother[i] = wp.vec3()
-    state.largest[i] = 0.0
-
-
 @wp.kernel
 def begin_kernel(each: int, state: State) -> None:
     """Starts every vertex where it is; `each` vertices a thread, as in every kernel for all vertices (`strips`)."""
     first = wp.tid() * each
     for i in range(first, first + each):
-        wipe(i, state)
         keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
         state.fresh[i] = 1
         if state.first_face[i] < 0:
@@ -87,7 +77,6 @@ def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
     """Goes on from where the last call ended: queries vertices that moved since and may have come within `reach`."""
     first = wp.tid() * each
     for i in range(first, first + each):
-        wipe(i, state)
         here = state.origin[i]
         way = wp.length(here - state.place[i])
         state.place[i] = here
@@ -243,9 +232,11 @@ def blend_kernel(state: State, cloth: Cloth, near: int, sweeps: int, long_step: 
 
 @wp.func
 def settle(i: int, state: State, skin: Skin, rules: Rules) -> None:
-    """Moves a vertex by `field`, and pushes it on if it isn't clear yet. Leaves marks empty."""
+    """Moves a vertex by `field`, and pushes it on if it isn't clear yet. Leaves fields and marks empty."""
     shift = state.field[i]
     mark = state.mark[i]
+    state.field[i] = wp.vec3()
+    state.smoother[i] = wp.vec3()
     state.mark[i] = 0
     state.fresh[i] = 1
     origin = state.origin[i]

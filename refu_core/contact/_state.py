@@ -79,7 +79,7 @@ class State:
     """The scale α of each vertex in `near`."""
     field: wp.array[wp.vec3]
     smoother: wp.array[wp.vec3]
-    """How far vertices are taken along, and the same a sweep later; zero before a push."""
+    """How far vertices are taken along, and the same a sweep later; zero between frames."""
     moved: wp.array[wp.int32]
     """Whether the end of an edge was raised in the last round."""
     suspects: wp.array[wp.int32]
