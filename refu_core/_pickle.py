@@ -147,6 +147,8 @@ def read_smpl_pickle(
     Raises `error`: it is too large, isn't a pickle, isn't a model, or holds anything but arrays under one of the keys.
     """
     with open_file(path, most=MAX_PICKLE_BYTES, error=error, wanted=wanted) as file:
+        if file.peek(2).startswith(b"PK"):
+            raise error(f"{path}: an archive, as torch.save writes it, and no pickle: save its arrays by numpy.savez")
         try:
             content = Unpickler(file).load()
         except DAMAGE as cause:

@@ -239,6 +239,8 @@ def read_stream(file: BinaryIO) -> tuple[Any, Callable[[str], bytes]]:
     root = unpickler.load()
     parts: dict[str, bytes] = {}
     for key in exactly(list, Unpickler(file).load()):
+        if key not in unpickler.storages:
+            raise ValueError("a tensor of a type that isn't read, as bfloat16: save it as float32")
         (count,) = struct.unpack("<q", file.read(8))
         size = count * unpickler.storages[key].itemsize
         part = file.read(size) if size >= 0 else b""

@@ -20,7 +20,12 @@ from refu_core.errors import printable
 
 BAG_SUFFIXES = (".mcap", ".db3")
 _MAX_WARNINGS = 20
-_FOREIGN = {b"#ROSBAG": "convert it with `rosbags-convert`", b"\x28\xb5\x2f\xfd": "unpack it with `zstd -d`"}
+_FOREIGN = {
+    b"#ROSBAG": "convert it with `rosbags-convert`",
+    b"\x28\xb5\x2f\xfd": "unpack it with `zstd -d`",
+    b"\x1f\x8b": "unpack it with `gunzip`",
+    b"version https://": "Git LFS holds its content: fetch it with `git lfs pull`",
+}
 """What to do with other files, by their first bytes."""
 
 

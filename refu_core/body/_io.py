@@ -10,7 +10,6 @@ from pathlib import Path
 
 import torch
 
-from refu_core._device import checked_device
 from refu_core._npz import read_npz
 from refu_core._pickle import read_smpl_pickle
 from refu_core.body._model import BodyArrays, SmplBody
@@ -35,7 +34,6 @@ def load_body(
         BodyError: no such body or file, a file that can't be read, or one that isn't an SMPL-layout model.
         RefuError: no such device.
     """
-    device = checked_device(device)
     if str(source) in BUILTIN_BODIES:
         return SmplBody(_builtin(str(source)), name=str(source), device=device, dtype=dtype)
     require_type(source, (str, PathLike), "a body's name or path", error=BodyError)

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from refu_core._device import checked_device
 from refu_core.body._fingers import without_fingers
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
@@ -109,6 +110,8 @@ class BodyArrays:
             raise BodyError(f"{source}: shapedirs must be (V, 3, {N_BETAS} or more), got {shapedirs.shape}")
         require("shapedirs", shapedirs, (n, 3, n_shapes))
         require("f", faces, (_n_rows(faces.shape), 3))
+        if (faces % 1).any():
+            raise BodyError(f"{source}: f must hold whole numbers, those of vertices")
         require("weights", read["weights"], (n, N_JOINTS))
         require("J_regressor", read["J_regressor"], (N_JOINTS, n))
         posedirs = read["posedirs"] if "posedirs" in read and read["posedirs"].any() else None
@@ -164,6 +167,8 @@ def _shape_hint(shape: tuple[int, ...], wanted: tuple[int, ...]) -> str:
     flat = (wanted[0] * wanted[1], *wanted[2:])
     if shape == wanted[::-1]:
         return ": transpose it"
+    if shape[:1] + shape[2:] == (wanted[0], 93):
+        return ": they are STAR's, of other features of the pose; leave them out, or give SMPL's own file"
     if shape == flat:
         return f": reshape it to {wanted}"
     return f": transpose it, and reshape it to {wanted}" if shape == flat[::-1] else ""
@@ -178,11 +183,13 @@ class SmplBody:
     def __init__(
         self, arrays: BodyArrays, *, name: str, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
     ) -> None:
+        if dtype not in (torch.float32, torch.float64):
+            raise BodyError(f"wanted a body in torch.float32 or torch.float64, got {dtype}")
         self.name = name
         """What the body was loaded as: a built-in name or a file's stem."""
         self.arrays = arrays
         """As in its file, in float64; those of built-in bodies are shared and read-only."""
-        self.device = torch.device(device)
+        self.device = checked_device(device)
         self.dtype = dtype
 
         def tensor(array: NDArray[Any]) -> Tensor:
@@ -233,11 +240,14 @@ class SmplBody:
         return digest.hexdigest()[:16]
 
     def to(self, *, device: str | torch.device | None = None, dtype: torch.dtype | None = None) -> SmplBody:
-        """The same body on another device or in another precision."""
+        """The same body on another device or in another precision. Raises `RefuError` where there is no such one."""
         return SmplBody(self.arrays, name=self.name, device=device or self.device, dtype=dtype or self.dtype)
 
     def _batch(self, name: str, value: ArrayLike | Tensor, width: tuple[int, ...]) -> Tensor:
-        tensor = _tensor(name, value, self.device).to(self.dtype)
+        given = _tensor(name, value, self.device)
+        if given.is_complex():
+            raise FrameError(f"{name} must be real numbers, got {given.dtype}")
+        tensor = given.to(self.dtype)
         if tensor.shape[1:] not in (width, (math.prod(width),)) or tensor.ndim < 2:
             raise FrameError(f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}")
         return tensor.reshape(-1, *width)

@@ -102,6 +102,8 @@ class Resolver(Unpicklable):
         self._read_counts = self._counts.numpy() if self._is_serial else np.zeros(0)
         self._known: dict[tuple[Any, float], dict[str, Any]] = {}
         self._last_sdf: MeshSdf | None = None
+        self._is_torn = False
+        """Whether the last call was interrupted, and may have left what it worked with behind."""
 
     @torch.no_grad()
     def __call__(
@@ -144,6 +146,11 @@ class Resolver(Unpicklable):
         with torch_stream(self.device):
             self._commands = self._launches(sdf.skin(), margin)
             self._counts.zero_()
+            if self._is_torn:
+                for left in (self._vectors["field"], self._vectors["smoother"], self._floats["largest"]):
+                    left.zero_()
+                self._ints["mark"].zero_()
+            self._is_torn = True
             if not self._is_serial:
                 self._bounds.zero_()
             self._vectors["origin"].copy_(points)
@@ -166,6 +173,7 @@ class Resolver(Unpicklable):
                 self._raise_edges()
             if n:
                 self._run("tally")
+        self._is_torn = False
         depth = -self._floats["first"].amin(0, keepdim=True)
         counts = self._counts[_state.INSIDE : _state.STUCK + 1].float()
         numbers = torch.cat((counts, depth.clamp_min(0)))

@@ -166,6 +166,7 @@ class GarmentPipeline:
         """
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
+        require_type(contact, ContactSettings, "ContactSettings")
         require_type(threads, int, "a number of threads")
         if threads < 1:
             raise RefuError(f"wanted at least one thread, got {threads}")
@@ -217,10 +218,9 @@ class GarmentPipeline:
                 require_type(one, SmplFrame, "a SmplFrame in every place of the sequence", error=FrameError)
         margin = self.margin if margin is None else margin
         _check_margin(margin)
-        with self._crew.turn() as step:
-            if isinstance(frames, SmplFrame):
-                return self._dress_all(step, [frames], margin)[0]
-            return self._dress_all(step, frames, margin)
+        batch = [frames] if isinstance(frames, SmplFrame) else frames
+        outputs = self._crew.call(partial(self._dress_all, frames=batch, margin=margin))
+        return outputs[0] if isinstance(frames, SmplFrame) else outputs
 
     def adjusted(self, frame: SmplFrame, adjust: Adjust) -> PipelineOutput:
         """Dresses one frame, and lets `adjust` change what was predicted before it is brought off the body.
@@ -237,8 +237,7 @@ class GarmentPipeline:
         given: object = adjust
         if not callable(given):
             raise FrameError(f"wanted a function of a Dressed, got {type(given).__name__}")
-        with self._crew.turn() as step:
-            return self._run(step, [frame], self.margin, adjust)[0]
+        return self._crew.call(partial(self._run, frames=[frame], margin=self.margin, adjust=adjust))[0]
 
     def _dress_all(self, step: FrameStep, frames: Sequence[SmplFrame], margin: float | None) -> list[PipelineOutput]:
         keys = [_key(frame) for frame in frames]

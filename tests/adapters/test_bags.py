@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import resource
 import shutil
@@ -445,6 +446,8 @@ def make_odd_metadata(path: Path) -> None:
             lambda path: path.write_text("hello, world"),
             "not an MCAP file; wanted a .mcap or .db3 file, a rosbag2 directory",
         ),
+        (lambda path: path.write_text("version https://git-lfs.github.com/spec/v1"), "`git lfs pull`"),
+        (lambda path: path.write_bytes(gzip.compress(b"")), "unpack it with `gunzip`"),
         (lambda path: (path.mkdir(), (path / "0.db3").write_text("hello, world")), "not an SQLite file; wanted"),
         (make_sqlite, "the database can.t be read"),
         (make_other_storage, "stored as my_storage .* only plain mcap or sqlite3 is read; convert it"),

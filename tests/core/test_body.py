@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pickle
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from refu_core import BodyError, FrameError, load_body
+from refu_core import BodyError, FrameError, RefuError, load_body
 from refu_core.body import (
     ARMS,
     BUILTIN_BODIES,
@@ -178,6 +180,7 @@ def test_up_does_not_tell_the_heading_and_has_derivatives() -> None:
     [
         (np.zeros((1, 23, 3)), None, None, r"pose must have the shape \(B, 24, 3\)"),
         (np.zeros((24, 3)), None, None, r"pose must have the shape \(B, 24, 3\)"),
+        (np.zeros((1, 72), complex), None, None, "pose must be real numbers, got torch.complex128"),
         (np.zeros((1, 72)), np.zeros((1, 11)), None, r"betas must have the shape \(B, 10\)"),
         (np.zeros((3, 72)), np.zeros((2, 10)), None, r"betas must have the shape \(3, 10\)"),
         (np.zeros((3, 72)), None, np.zeros((3, 2)), r"transl must have the shape \(3, 3\)"),
@@ -188,6 +191,15 @@ def test_wrong_shapes(
 ) -> None:
     with pytest.raises(FrameError, match=wanted):
         load_body("male")(pose, betas, transl)
+
+
+@pytest.mark.parametrize("wanted", [torch.float16, torch.int64, np.float32, "float32"])
+def test_a_body_is_single_or_double(wanted: Any) -> None:
+    for make in (partial(load_body, "male"), load_body("male").to):
+        with pytest.raises(BodyError, match=r"wanted a body in torch.float32 or torch.float64, got "):
+            make(dtype=wanted)
+    with pytest.raises(RefuError, match="no device"):
+        load_body("male").to(device="tpu")
 
 
 def test_fingerprint_tells_bodies_apart() -> None:
@@ -223,6 +235,8 @@ def save(path: Path, **changes: object) -> Path:
         ({"v_template": np.full((60, 3), np.nan)}, "NaN or infinite"),
         ({"v_template": np.array(["a"] * 60)}, "not an array of numbers"),
         ({"v_template": np.array([{}])}, "can't be read as .npz"),
+        ({"f": np.full((9, 3), 0.5)}, "f must hold whole numbers"),
+        ({"posedirs": np.ones((60, 3, 93))}, "posedirs .* STAR's"),
         ({"f": np.full((9, 3), 60)}, "faces must index 60 vertices"),
         ({"weights": np.ones((60, 24))}, "must sum to one.* got sums from 24 to 24 .*divide each vertex's weights"),
         ({"weights": np.ones((60, 55))}, r"weights must have the shape \(60, 24\)"),

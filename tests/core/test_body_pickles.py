@@ -94,6 +94,16 @@ def test_what_a_model_does_not_need_may_be_of_any_kind(tmp_path: Path) -> None:
         load_body(tmp_path / "model.npz")
 
 
+def test_what_torch_writes_and_isnt_read_is_named(tmp_path: Path) -> None:
+    data, path = random_model(np.random.default_rng(6)), tmp_path / "model.pkl"
+    path.write_bytes(pickle.dumps(data | {"weights": torch.as_tensor(data["weights"]).bfloat16()}))
+    with pytest.raises(BodyError, match=r"weights can't be read: .* as bfloat16: save it as float32"):
+        load_body(path)
+    torch.save(data, path)
+    with pytest.raises(BodyError, match=r"torch.save writes it.* by numpy.savez"):
+        load_body(path)
+
+
 @given(data=st.data(), kind=st.sampled_from(("csr", "coo")))
 def test_damaged_sparse_matrices_raise_body_errors_only(
     data: st.DataObject, kind: str, tmp_path_factory: pytest.TempPathFactory

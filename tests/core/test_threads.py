@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import copy
+import math
 import os
 import pickle
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from warp import Launch
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body
 from refu_core.body import Collider
@@ -136,7 +139,8 @@ def test_a_fork_in_the_middle_of_a_call_is_told_and_not_waited_for() -> None:
     """Other threads don't outlive it: the memory that they work in never comes back."""
     pipeline = GarmentPipeline.load(_GARMENTS[1:], backbone="skinned", sdf="none")
     frame = _frames(1)[0]
-    with pipeline._crew.turn():
+
+    def fork(_: FrameStep) -> int:
         child = os.fork()
         if not child:
             signal.alarm(300)
@@ -145,7 +149,9 @@ def test_a_fork_in_the_middle_of_a_call_is_told_and_not_waited_for() -> None:
             except RefuError as error:
                 os._exit(0 if "busy when its process was forked: load one in each process" in str(error) else 1)
             os._exit(2)
-    assert os.waitpid(child, 0)[1] == 0
+        return child
+
+    assert os.waitpid(pipeline._crew.call(fork), 0)[1] == 0
     pipeline(frame)
 
 
@@ -206,6 +212,57 @@ def test_who_fails_in_a_batch_leaves_the_pipeline_as_it_was() -> None:
     assert len(pipeline(frames[:3])) == 3
 
 
+def test_ctrl_c_between_two_instructions_loses_no_step() -> None:
+    """Python heeds signals when a function begins, and when one of C's has returned."""
+    crew, left = GarmentPipeline.load(_GARMENTS[1:], backbone="skinned", sdf="none")._crew, 0
+
+    def interrupt(_: object, event: str, __: object) -> None:
+        nonlocal left
+        left -= event in ("call", "c_return")
+        if left < 0:
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+    for n in range(1000):
+        left = n
+        try:
+            sys.setprofile(interrupt)
+            crew.call(lambda _: None)
+        except KeyboardInterrupt:
+            continue
+        else:
+            break
+        finally:
+            sys.setprofile(None)
+            assert crew._free.qsize() == 1, "a later call would wait for ever"
+    assert 5 < n < 1000
+
+
+def test_ctrl_c_in_the_middle_of_a_frame_changes_no_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline, (first, second, third) = GarmentPipeline.load(_GARMENTS[:1]), _frames(3, seed=3)
+    wanted, launch, left = pipeline(third), Launch.launch, math.inf
+
+    def interrupt(*given: Any, **options: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            left = math.inf
+            raise KeyboardInterrupt
+        return launch(*given, **options)
+
+    monkeypatch.setattr(Launch, "launch", interrupt)
+    for n in range(1000):
+        pipeline(first)  # not the third again, which would be known
+        left = n
+        try:
+            pipeline(second)
+        except KeyboardInterrupt:
+            assert _are_equal(pipeline(third), wanted), n
+        else:
+            break
+    assert 10 < n < 1000
+
+
 def test_a_batch_after_a_fork_is_dressed_by_one_thread() -> None:
     """The others of its parent's pool don't outlive it."""
     pipeline, frames = GarmentPipeline.load(_GARMENTS[1:], backbone="skinned", threads=2), _frames(3)
@@ -217,9 +274,36 @@ def test_a_batch_after_a_fork_is_dressed_by_one_thread() -> None:
     assert os.waitpid(child, 0)[1] == 0
 
 
+_AT_EXIT = """
+import atexit, threading, time
+from refu_core import GarmentPipeline, SmplFrame
+pipeline = GarmentPipeline.load(["short-pant-male"], threads=2)
+frames = [SmplFrame(pose=[k / 1000] * 72) for k in range(3)]
+atexit.register(lambda: print(len(pipeline(frames)), "at exit"))
+def dress():
+    k = 0
+    while True:
+        k += 1
+        pipeline(SmplFrame(pose=[k * 1e-6] * 72))
+threading.Thread(target=dress, daemon=True).start()
+time.sleep(0.5)
+"""
+
+
+def test_a_daemon_thread_in_a_call_does_not_abort_a_program_that_ends() -> None:
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", _AT_EXIT], capture_output=True, text=True, timeout=300, check=False
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (0, "3 at exit\n", "")
+
+
 def _all_steps(pipeline: GarmentPipeline) -> list[FrameStep]:
-    with contextlib.ExitStack() as stack:
-        return [stack.enter_context(pipeline._crew.turn()) for _ in range(pipeline.threads)]
+    free = pipeline._crew._free
+    steps = [free.get(timeout=60) for _ in range(pipeline.threads)]
+    for step in steps:
+        free.put(step)
+    return steps
 
 
 def test_what_holds_memory_of_warp_says_that_it_cannot_leave_its_process() -> None:
