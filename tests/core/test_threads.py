@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from warp import Launch
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body
+from refu_core._warp import Recorded
 from refu_core.body import Collider
 from refu_core.contact import Resolver
 from refu_core.metrics import CollisionChecker, SelfContactDetector
@@ -240,7 +240,7 @@ def test_ctrl_c_between_two_instructions_loses_no_step() -> None:
 
 def test_ctrl_c_in_the_middle_of_a_frame_changes_no_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline, (first, second, third) = GarmentPipeline.load(_GARMENTS[:1]), _frames(3, seed=3)
-    wanted, launch, left = pipeline(third), Launch.launch, math.inf
+    wanted, launch, left = pipeline(third), Recorded.launch, math.inf
 
     def interrupt(*given: Any, **options: Any) -> Any:
         nonlocal left
@@ -250,7 +250,7 @@ def test_ctrl_c_in_the_middle_of_a_frame_changes_no_later_one(monkeypatch: pytes
             raise KeyboardInterrupt
         return launch(*given, **options)
 
-    monkeypatch.setattr(Launch, "launch", interrupt)
+    monkeypatch.setattr(Recorded, "launch", interrupt)
     for n in range(1000):
         pipeline(first)  # not the third again, which would be known
         left = n

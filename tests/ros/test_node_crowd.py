@@ -194,10 +194,10 @@ def test_a_clock_set_back_has_things_where_they_will_be(node: Any, monkeypatch: 
 
 
 def test_a_topic_of_two_types_is_said_to_be_one(ros: None) -> None:  # noqa: ARG001
-    remapped = ["--ros-args", "-r", "garments:=smpl_params"]
+    remapped = ["--ros-args", "-r", "garments:=of_two_types", "-r", "smpl_params:=of_two_types"]
     node = GarmentNode(cli_args=remapped)
     try:
-        with pytest.raises(RefuError, match=r"can't subscribe to /smpl_params as std_msgs.*another type"):
+        with pytest.raises(RefuError, match=r"can't subscribe to /of_two_types as std_msgs.*another type"):
             node._listener.subscribe()
     finally:
         node.close()
