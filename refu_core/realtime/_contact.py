@@ -180,7 +180,8 @@ class ContactStage:
         """
         given = vertices
         vertices, start = self.own_side(name, vertices, on_mean, margin + ASKED_FROM)
-        pressed = pressed + (vertices - given)
+        if vertices is not given:
+            pressed = pressed + (vertices - given)
         assert start.face is not None  # these distances are to faces
         n_clipped = torch.count_nonzero(start.face < 0)
         resolver = self.resolvers[name]
@@ -196,7 +197,9 @@ class ContactStage:
             done = resolver(vertices, self.sdf, None, margin=kept)
         if worn:
             done = self._part(name, done, margin=kept)
-        vertices, numbers[_N_UNRESOLVED] = done.vertices, torch.count_nonzero(done.distance < 0)
+        vertices = done.vertices
+        if self.way_out is None:  # which would count them by itself
+            numbers[_N_UNRESOLVED] = torch.count_nonzero(done.distance < 0)
         if was_torn or worn:
             vertices = self._within_reach(vertices, pressed)
         vertices = self._taken_out(vertices, pressed, margin, numbers)
