@@ -147,7 +147,7 @@ class NodeSettings(DressOptions):
 def _names_a_folder(path: str) -> bool:
     try:
         return "\0" not in path and Path(path).expanduser().absolute().name != ""
-    except RuntimeError:  # the home of a user who doesn't exist
+    except (OSError, RuntimeError):  # the working directory is gone, the home of a user who doesn't exist
         return False
 
 
