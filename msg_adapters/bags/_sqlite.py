@@ -66,7 +66,7 @@ class SqliteFile:
                     what = "{} is left out: SQLite reads it only in a folder it may write to; copy both files to one"
                     self.report(DamageError(what, log.name))
             place = quote(os.fsencode(self._path.absolute()))
-            with closing(sqlite3.connect(f"file:{place}?{how}", uri=True)) as database:
+            with closing(sqlite3.connect(f"file:{place}?{how}", uri=True, timeout=1.0)) as database:
                 # `messages` may be paused for long between two steps, so it is steps that count, not seconds.
                 looks = iter(range(200 + 4 * self._path.stat().st_size // _STEPS))
                 database.set_progress_handler(lambda: next(looks, None) is None, _STEPS)
