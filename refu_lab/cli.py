@@ -52,6 +52,10 @@ def _run(arguments: Sequence[str] | None) -> int:
             args = _parser().parse_args(arguments)
         finally:  # after its help the parser ends the program
             print(end="", flush=True)
+        try:
+            os.getcwd()  # noqa: PTH109
+        except OSError as error:  # whatever needs it would name no file
+            raise RefuError(f"the working directory is gone ({error.strerror}): cd to another") from error
         written = _outputs(args)
         for path in written.values():
             _common.check_writable(path)

@@ -70,9 +70,8 @@ class Bank:
         return str(self._publishers[topic].topic_name)
 
     def watchers(self, topic: str) -> int:
-        with contextlib.suppress(InvalidHandle):  # destroyed meanwhile
-            if (publisher := self._publishers.get(topic)) is not None:
-                return int(publisher.get_subscription_count())
+        with contextlib.suppress(KeyError, InvalidHandle):  # destroyed meanwhile
+            return int(self._publishers[topic].get_subscription_count())
         return 0
 
     def is_watched(self) -> bool:
@@ -80,6 +79,5 @@ class Bank:
 
     def send(self, topic: str, data: bytes) -> None:
         """Publishes, if the topic still exists."""
-        if (publisher := self._publishers.get(topic)) is not None:
-            with contextlib.suppress(InvalidHandle):
-                publisher.publish(data)
+        with contextlib.suppress(KeyError, InvalidHandle):
+            self._publishers[topic].publish(data)

@@ -15,6 +15,7 @@ from typing import Any
 
 from refu_core._collector import collect_rarely, keep_what_is_loaded
 from refu_core._files import keep_streams
+from refu_core.errors import printable
 
 EXIT_BAD_INPUT = 2
 _LOOK_UP_S = 0.25
@@ -62,7 +63,7 @@ def run(
 
 
 def _refuse(program: str, text: str) -> int:
-    sys.stderr.write(f"{program}: error: {' '.join(text.split())}\n")
+    sys.stderr.write(f"{program}: error: {printable(text)}\n")
     return EXIT_BAD_INPUT
 
 

@@ -22,11 +22,14 @@ _SLOWEST_HZ = 0.01
 AXES = ("smpl", "frame")
 
 
-def require_persons(persons: Sequence[str]) -> list[str]:
-    """Those of the persons that have a name. Raises `SettingsError` unless names are distinct and good for topics."""
+def require_names(persons: Sequence[str], frame_id: str) -> list[str]:
+    """Those of the persons that have a name. Raises `SettingsError` for names that topics, or tf2, can't have."""
     named = [*filter(None, persons)]
     if not all(map(_PERSON.fullmatch, named)) or len(set(persons)) < len(persons):
         raise SettingsError(f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}")
+    if not _FRAME.fullmatch(frame_id):
+        msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {frame_id!r}"
+        raise SettingsError(msg)
     return named
 
 
@@ -98,7 +101,7 @@ class NodeSettings(DressOptions):
 
     def __post_init__(self) -> None:
         check(self)
-        named = require_persons(self.persons)
+        named = require_names(self.persons, self.frame_id)
         if not self.persons or (len(named) < len(self.persons) > 1):
             msg = f"persons: wanted one person without a name, or names for all, got {list(self.persons)}"
             raise SettingsError(msg)
@@ -107,9 +110,6 @@ class NodeSettings(DressOptions):
             raise SettingsError(msg)
         if unknown := sorted(set(self.points_fields) - {"", *POINT_FIELDS}):
             raise SettingsError(f"points_fields: wanted names of {', '.join(POINT_FIELDS)}, got {', '.join(unknown)}")
-        if not _FRAME.fullmatch(self.frame_id):
-            msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {self.frame_id!r}"
-            raise SettingsError(msg)
         for name, path in (("record", self.record), ("weights", self.weights), ("bags", self.bags)):
             if path and not _names_a_folder(path):
                 raise SettingsError(f"{name}: wanted the path of a folder, got {path!r}")
@@ -147,7 +147,7 @@ class NodeSettings(DressOptions):
 def _names_a_folder(path: str) -> bool:
     try:
         return "\0" not in path and Path(path).expanduser().absolute().name != ""
-    except RuntimeError:  # the home of a user who doesn't exist
+    except (OSError, RuntimeError):  # the working directory is gone, the home of a user who doesn't exist
         return False
 
 

@@ -22,7 +22,7 @@ from refu_core.recordings import Axes
 from refu_ros._guard import GuardedNode
 from refu_ros._interfaces import interface
 from refu_ros._program import hear, run, spin
-from refu_ros._settings import AXES, declare, listing, require_persons
+from refu_ros._settings import AXES, declare, listing, require_names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class PublisherOptions:
 
     def __post_init__(self) -> None:
         check(self)
-        require_persons(self.persons)
+        require_names(self.persons, self.frame_id or WORLD_FRAME)
 
 
 class SmplPublisher(GuardedNode):

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from msg_adapters import BagWriter
 from refu_core import GarmentPipeline, RefuError
 from refu_core._device import checked_device
 from refu_lab import cli
@@ -82,6 +83,21 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 @pytest.mark.parametrize("name", ["a\0b", "a\ud800b", ""])
 def test_names_that_no_file_has(command: str, option: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert f"argument {option}: wanted a path" in refused([*NEEDED[command], option, name], capsys)
+
+
+def test_a_working_directory_that_was_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was "[Errno 2]" without a name, or torch ended the process."""
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    try:
+        assert "the working directory is gone" in refused(["replay", BAG, "--output", "out"], capsys)
+        with pytest.raises(RefuError, match="out: can't be written: No such file"):
+            BagWriter("out")
+    finally:
+        os.chdir(tmp_path)
 
 
 @pytest.mark.parametrize(("command", "option"), PATHS)

@@ -113,6 +113,20 @@ def test_ever_new_topics_end_no_recording(tmp_path: Path, monkeypatch: pytest.Mo
     assert times(tmp_path / "bag") == [0, 1, 2, 3, 4, 5, 7, 9, 11]
 
 
+def test_a_program_that_ends_without_closing_has_a_whole_bag(tmp_path: Path) -> None:
+    """Python waits for threads, and the recorder's waited for messages: the program never ended."""
+    lines = [
+        "from msg_adapters.bags import QosProfile, Recorder",
+        "recorder = Recorder('bag')",
+        f"recorder.put('/p', {TYPE!r}, bytes(16), time_ns=1, qos=QosProfile())",
+        "raise KeyboardInterrupt",
+    ]
+    path = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=tmp_path, env=path, timeout=60, check=False)
+    assert times(tmp_path / "bag") == [1]
+    assert (tmp_path / "bag" / "metadata.yaml").exists()
+
+
 def test_a_read_only_place_cannot_be_recorded_to(tmp_path: Path) -> None:
     if os.geteuid() == 0:
         place = Path("/proc/sys")  # root may write wherever permissions say no, but not here

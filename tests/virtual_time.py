@@ -62,7 +62,7 @@ class VirtualTime:
 
     # What `threading` has -------------------------------------------------------------------------
 
-    def Thread(self, *, target: Callable[[], object], name: str) -> _Thread:  # noqa: N802, ARG002
+    def Thread(self, *, target: Callable[[], object], name: str, daemon: bool) -> _Thread:  # noqa: N802, ARG002
         """Runs in `run`."""
         return _Thread(self._targets, target)
 

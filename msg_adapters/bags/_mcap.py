@@ -28,6 +28,7 @@ from msg_adapters.errors import BagError
 from refu_core._files import open_file
 
 MAGIC = b"\x89MCAP0\r\n"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B, 0x0F
 _WANTED = frozenset({FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_END})
 
@@ -145,20 +146,38 @@ def unpack_chunk(content: memoryview, budget: Budget) -> memoryview:
     size, crc = fields.number(8), fields.number(4)
     compression = fields.string()
     packed = fields.take(fields.number(8))
-    if size > MAX_CHUNK_BYTES:
-        raise DamageError("a chunk that unpacks to {} MiB, at most {} are read", size >> 20, MAX_CHUNK_BYTES >> 20)
-    if size > max(_SMALL_CHUNK, _MAX_RATIO * len(packed)):
-        raise DamageError("a chunk of {} bytes that unpacks to {} MiB", len(packed), size >> 20)
-    budget.spend("bytes unpacked", size)
-    records = packed if not compression else memoryview(_decompress(compression, packed, size))
-    if len(records) != size:
-        raise DamageError("a chunk that unpacks to {} bytes where {} were announced", len(records), size)
+    records = _unpacked("a chunk", compression, packed, size, budget)
     if crc and zlib.crc32(records) != crc:
         raise DamageError("a chunk whose checksum is wrong")
-    return records
+    return memoryview(records)
 
 
-def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
+def unpack_message(data: Buffer, budget: Budget) -> Buffer:
+    """A message in CDR, also where rosbag2 has compressed each message by itself: CDR begins otherwise."""
+    if data[: len(ZSTD_MAGIC)] != ZSTD_MAGIC:
+        return data
+    try:
+        size = zstandard.frame_content_size(data)
+    except zstandard.ZstdError as error:
+        raise DamageError("a message that zstd can't unpack ({})", error) from None
+    if size < 0:
+        raise DamageError("a message packed by zstd without its size")
+    return _unpacked("a message", "zstd", data, size, budget)
+
+
+def _unpacked(what: str, compression: str, packed: Buffer, size: int, budget: Budget) -> Buffer:
+    if size > MAX_CHUNK_BYTES:
+        raise DamageError("{} that unpacks to {} MiB, at most {} are read", what, size >> 20, MAX_CHUNK_BYTES >> 20)
+    if size > max(_SMALL_CHUNK, _MAX_RATIO * len(packed)):
+        raise DamageError("{} of {} bytes that unpacks to {} MiB", what, len(packed), size >> 20)
+    budget.spend("bytes unpacked", size)
+    unpacked = packed if not compression else _decompress(what, compression, packed, size)
+    if len(unpacked) != size:
+        raise DamageError("{} that unpacks to {} bytes where {} were announced", what, len(unpacked), size)
+    return unpacked
+
+
+def _decompress(what: str, compression: str, packed: Buffer, size: int) -> bytes:
     """At most one byte more than `size`, whatever the compressed data claims."""
     if compression == "zstd":
         try:
@@ -167,7 +186,7 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
             ) as reader:
                 return reader.read(size + 1)
         except (zstandard.ZstdError, MemoryError) as error:
-            raise DamageError("a chunk that zstd can't unpack ({})", error) from None
+            raise DamageError("{} that zstd can't unpack ({})", what, error) from None
     if compression == "lz4":
         try:
             lz4 = import_module("lz4.frame")  # optional: rosbag2 compresses with zstd
@@ -176,8 +195,8 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes:
         try:
             return bytes(lz4.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
         except (RuntimeError, EOFError, MemoryError) as error:
-            raise DamageError("a chunk that lz4 can't unpack ({})", error) from None
-    raise DamageError("a chunk of unknown compression {!r}", compression)
+            raise DamageError("{} that lz4 can't unpack ({})", what, error) from None
+    raise DamageError("{} of unknown compression {!r}", what, compression)
 
 
 def split_records(content: memoryview) -> Iterator[tuple[int, memoryview]]:

@@ -170,20 +170,21 @@ def dump_metadata(
 def read_file_paths(directory: Path) -> list[Path]:
     """The files of a rosbag2 directory in order, as its metadata.yaml lists them.
 
-    Raises `BagError` where the metadata can't be read, or names another storage or rosbag2's own compression.
+    Raises `BagError` where the metadata can't be read, or names another storage or a compression of whole files.
     """
     path = directory / METADATA_FILE
     text = read_file(path, most=_MAX_BYTES, error=BagError, wanted="rosbag2's metadata")
     try:
         information = _load(text)[_KEY]
         storage = str(information["storage_identifier"])
-        compression = str(information.get("compression_mode") or "none").lower()
+        packed = [str(information.get(f"compression_{key}") or "none").lower() for key in ("mode", "format")]
         # Only file names are used: old versions list paths with the directory, and a bag is read from one directory.
         names = [name.replace("\\", "/").rsplit("/", maxsplit=1)[-1] for name in information["relative_file_paths"]]
     except _UNREADABLE as error:
         msg = f"{path}: not rosbag2 metadata ({type(error).__name__}); give one of the bag's files instead"
         raise BagError(msg) from error
-    if storage not in STORAGES or compression != "none":
-        how = f"stored as {storage} with compression mode {compression}, only plain {' or '.join(STORAGES)} is read"
+    if storage not in STORAGES or (packed[0] != "none" and packed != ["message", "zstd"]):
+        only = f"apart from messages in zstd only plain {' or '.join(STORAGES)} is read"
+        how = f"stored as {storage} with compression mode {packed[0]} and format {packed[1]}: {only}"
         raise BagError(f"{directory}: {how}; convert it with `ros2 bag convert`")
     return [directory / name for name in dict.fromkeys(names)]

@@ -11,7 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from msg_adapters.bags._mcap import MAGIC, WANTED_FILE, Budget, DamageError, McapFile, open_bag_file
+from msg_adapters.bags._mcap import (
+    MAGIC,
+    WANTED_FILE,
+    ZSTD_MAGIC,
+    Budget,
+    DamageError,
+    McapFile,
+    open_bag_file,
+    unpack_message,
+)
 from msg_adapters.bags._metadata import MAX_TIME_NS, METADATA_FILE, TopicInfo, read_file_paths
 from msg_adapters.bags._sqlite import MAGIC as SQLITE_MAGIC
 from msg_adapters.bags._sqlite import SqliteFile
@@ -22,7 +31,7 @@ BAG_SUFFIXES = (".mcap", ".db3")
 _MAX_WARNINGS = 20
 _FOREIGN = {
     b"#ROSBAG": "convert it with `rosbags-convert`",
-    b"\x28\xb5\x2f\xfd": "unpack it with `zstd -d`",
+    ZSTD_MAGIC: "unpack it with `zstd -d`",
     b"\x1f\x8b": "unpack it with `gunzip`",
     b"version https://": "Git LFS holds its content: fetch it with `git lfs pull`",
 }
@@ -156,7 +165,8 @@ class BagReader:
             self._claimed |= claimed
             for topic, count in topics:
                 known = merged.get(topic.name, topic)
-                merged[topic.name] = replace(known, message_count=known.message_count + count)
+                read = known if known.encoding == "cdr" else topic  # a JSON channel may be declared before it
+                merged[topic.name] = replace(read, message_count=known.message_count + count)
         return tuple(merged[name] for name in sorted(merged))
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[BagMessage]:
@@ -167,10 +177,16 @@ class BagReader:
         budget = self._begin()
         for file in self._files:
             for topic, log_ns, publish_ns, data in file.messages(budget):
-                if min(log_ns, publish_ns) < 0 or max(log_ns, publish_ns) > MAX_TIME_NS:
+                if not 0 <= log_ns <= MAX_TIME_NS:
                     file.report(DamageError("a message on {} at a time that ROS can't hold", topic.name))
                 elif topics is None or topic.name in topics:
-                    yield BagMessage(topic.name, topic.message_type, log_ns, publish_ns, bytes(data))
+                    try:
+                        whole = unpack_message(data, budget) if topic.encoding == "cdr" else data
+                    except DamageError as damage:
+                        file.report(damage)
+                        continue
+                    sent_ns = publish_ns if publish_ns <= MAX_TIME_NS else log_ns  # often never set by its recorder
+                    yield BagMessage(topic.name, topic.message_type, log_ns, sent_ns, bytes(whole))
 
 
 def _is_of_bag(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import math
 import shutil
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 from msg_adapters.bags._metadata import METADATA_FILE, QosProfile
 from msg_adapters.bags._reader import BAG_SUFFIXES
@@ -137,7 +139,8 @@ class Recorder:
         self._error = ""
         self._stopping = False
         self._ended = ended
-        self._thread = threading.Thread(target=self._run, name="recorder")
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        _RECORDERS.add(self)
         self._thread.start()
 
     def put(self, topic: str, message_type: str, data: bytes, *, time_ns: int, qos: QosProfile) -> None:
@@ -235,6 +238,17 @@ class Recorder:
                 if self._stopping:
                     return None
                 self._changed.wait(left if left < math.inf else None)
+
+
+_RECORDERS = WeakSet[Recorder]()
+
+
+@atexit.register
+def _close_all() -> None:
+    """A program that ends without `close`, at an error for instance, has whole bags; else it would never end."""
+    for one in [*_RECORDERS]:
+        if not one.finished:  # as they are after a fork
+            one.close()
 
 
 class RunningRecording:

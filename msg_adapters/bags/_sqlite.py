@@ -7,6 +7,7 @@ more rows than anybody can count, each as long as the file. So SQLite's steps ar
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import sys
 from collections import Counter
@@ -55,10 +56,17 @@ class SqliteFile:
     def _opened(self) -> Iterator[sqlite3.Connection]:
         """The open database. Raises `DamageError` where it can't be read any further."""
         # A killed recorder may leave a log of what isn't in the database yet; only then are files beside it read.
-        log = self._path.with_name(f"{self._path.name}-wal")
-        how = "mode=ro" if log.exists() else "mode=ro&immutable=1"
+        log, index = (self._path.with_name(f"{self._path.name}-{end}") for end in ("wal", "shm"))
+        how = "mode=ro&immutable=1"
         try:
-            with closing(sqlite3.connect(f"file:{quote(str(self._path.absolute()))}?{how}", uri=True)) as database:
+            if log.exists() and log.stat().st_size:
+                if index.exists() or os.access(self._path.parent, os.W_OK):
+                    how = "mode=ro"
+                else:
+                    what = "{} is left out: SQLite reads it only in a folder it may write to; copy both files to one"
+                    self.report(DamageError(what, log.name))
+            place = quote(os.fsencode(self._path.absolute()))
+            with closing(sqlite3.connect(f"file:{place}?{how}", uri=True, timeout=1.0)) as database:
                 # `messages` may be paused for long between two steps, so it is steps that count, not seconds.
                 looks = iter(range(200 + 4 * self._path.stat().st_size // _STEPS))
                 database.set_progress_handler(lambda: next(looks, None) is None, _STEPS)
@@ -66,6 +74,10 @@ class SqliteFile:
                     database.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, _LONGEST_SQL)
                 database.execute("PRAGMA trusted_schema = OFF")
                 database.execute("PRAGMA cell_size_check = ON")
+                try:
+                    database.execute("PRAGMA schema_version").fetchone()
+                except sqlite3.DatabaseError:  # it is cut short: only whoever may mend a database reads what is left
+                    database.execute("PRAGMA writable_schema = ON")
                 yield database
         except _ERRORS as error:
             raise DamageError("the database can't be read ({})", error) from error

@@ -42,10 +42,6 @@ class BagWriter:
     ) -> None:
         self.path = Path(path)
         self._directory = None if self.path.suffix == ".mcap" else self.path
-        self.file_path = self.path if self._directory is None else self.path / f"{self.path.absolute().name}_0.mcap"
-        """The MCAP file itself."""
-        self._target = self._working = self.file_path
-        """Where that is, with links followed, and the file that is written until it is complete."""
         self._old: list[Path] = []
         """Files of the bag that was there before."""
         self._made: list[Path] = []
@@ -56,6 +52,11 @@ class BagWriter:
         self._finished = False
         try:
             with self._writing():
+                name = self.path.absolute().name  # fails in a folder that was removed
+                self.file_path = self.path if self._directory is None else self.path / f"{name}_0.mcap"
+                """The MCAP file itself."""
+                self._target = self._working = self.file_path
+                """Where that is, with links followed, and the file that is written until it is complete."""
                 self._stream = self._open(overwrite=overwrite)
                 self._writer = McapWriter(self._stream, chunk_bytes=chunk_bytes, in_background=in_background)
                 self._writer.start(profile="ros2", library=LIBRARY)
@@ -179,7 +180,9 @@ class BagWriter:
             self._entered.pop()
 
     def _open(self, *, overwrite: bool) -> BinaryIO:
-        str(self.file_path).encode()  # metadata and diagnostics, which name it, are UTF-8
+        name = str(self.file_path)
+        if name.encode(errors="replace").decode() != name:  # metadata and diagnostics, which name it, are UTF-8
+            raise BagError(f"{self.path}: wanted a name in UTF-8, as a bag's metadata has it")
         if self._directory is not None and self._directory.exists():
             self._old = self._own_files(self._directory, overwrite=overwrite)
         parent = self.file_path.absolute().parent

@@ -91,10 +91,19 @@ class KeypointTracker:
             confidence: from 0 to 1, shape (K,); NaN and negative numbers count as 0. In a frame that has one above 2,
                 all are out of 100.
 
-        Raises `FrameError`: another number of keypoints, values that aren't numbers, or that can't be metres.
+        Raises `FrameError`: another number of keypoints, values that aren't numbers, or that can't be metres. Whatever
+        it raises, an interrupt too, the track is as it was.
         """
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
+        before = vars(self).copy()  # nothing in it is written to: it is replaced
+        try:
+            return self._updated(seen, stamp_ns)
+        except BaseException:
+            vars(self).update(before)
+            raise
+
+    def _updated(self, seen: _Seen, stamp_ns: int) -> SmplFrame | None:
         dt = 1e-9 * (stamp_ns - self._stamp)
         if self._is_here and not -1.0 < dt <= 1.0:
             self.reset()

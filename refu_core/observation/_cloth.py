@@ -145,7 +145,7 @@ class Estimate:
         self.mean = keeps * self.mean
         # The covariance becomes K C K + Q. Its inverse is Q⁻¹ - Q⁻¹ K (C⁻¹ + K Q⁻¹ K)⁻¹ K Q⁻¹ (Woodbury).
         rows = np.arange(len(keeps))
-        between = self.precision
+        between = self.precision.copy()
         between[rows, rows] += keeps**2 / comes
         ratio = keeps / comes
         self.precision = _inverse(between) * -ratio[:, None] * ratio
@@ -231,7 +231,7 @@ class ObservedCloth:
     def wait(self, seconds: float) -> None:
         """Lets time pass. The displacement fades as the numbers do."""
         self.estimate.wait(seconds)
-        self._lift *= math.exp(-seconds / self._settings.remembered)
+        self._lift = self._lift * np.float32(math.exp(-seconds / self._settings.remembered))
 
     def draw(self, numbers: NDArray[np.float64]) -> None:
         """Sets the displacement to that of numbers (D,), in standard deviations."""

@@ -68,18 +68,25 @@ class Observer:
                 (N, 3); None if nothing was measured: what was learnt is used, and fades.
             eye: where the camera is in the same axes [m], shape (3,): cloth that faces away from it isn't matched.
 
-        Raises `FrameError` for points or eye of another shape, or not finite (what was learnt is kept), and as the
-        pipeline does.
+        Raises `FrameError` for points or eye of another shape, or not finite, and as the pipeline does. Whatever it
+        raises, an interrupt too, what was learnt is as it was.
         """
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
         measured = np.empty((0, 3)) if points is None else _finite("points", points, 2)
         camera = None if eye is None else _finite("eye", eye, 1)
-        self._wait(frame)
 
         def adjust(dressed: Dressed) -> Dressed:
             return self._adjusted(dressed, measured - frame.transl, None if camera is None else camera - frame.transl)
 
-        return self._pipeline.adjusted(frame, adjust)
+        changed = [self, *self._cloths.values(), *(cloth.estimate for cloth in self._cloths.values())]
+        before = [vars(one).copy() for one in changed]  # what a frame changes in it is replaced, not written to
+        try:
+            self._wait(frame)
+            return self._pipeline.adjusted(frame, adjust)
+        except BaseException:
+            for one, state in zip(changed, before, strict=True):
+                vars(one).update(state)
+            raise
 
     def _wait(self, frame: SmplFrame) -> None:
         seconds = self._settings.step

@@ -309,6 +309,23 @@ def test_messages_of_another_type_on_the_topic_are_named(tmp_path: Path) -> None
     assert said == [f"wanted {INPUT_TYPES['joint_state']}, got {INPUT_TYPES['pose_array']}"] * 3
 
 
+def test_a_channel_in_another_encoding_costs_nothing_else(tmp_path: Path) -> None:
+    """The bag was refused where a bridge had declared its JSON before the node its CDR."""
+    data = encoder_for("joint_state")(frame(1))
+    with (tmp_path / "two.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        for encoding, schema, content in (("json", "jsonschema", b"{}"), ("cdr", "ros2msg", data)):
+            number = writer.register_schema(INPUT_TYPES["joint_state"], schema, b"")
+            writer.add_message(writer.register_channel(TOPIC, encoding, number), START_NS, content, 2**64 - 1)
+        writer.finish()
+    bag = open_smpl_bag(tmp_path / "two.mcap")
+    assert [record.frame is None for record in bag] == [True, False]
+    # A publish time that nobody has set is all ones; the log time stands for it.
+    assert [message.publish_time_ns for message in bag.reader.messages()] == [START_NS] * 2
+    assert bag.reader.warnings == []
+
+
 @pytest.mark.parametrize("last", ["missing", "empty", "packed"])
 @pytest.mark.parametrize("listed", [True, False])
 def test_one_file_that_cannot_be_read_costs_nothing_else(tmp_path: Path, last: str, *, listed: bool) -> None:
@@ -664,6 +681,8 @@ def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
     for path in (tmp_path / "file" / "bag", tmp_path / "file" / "bag.mcap"):
         with pytest.raises(BagError, match=r"can't be written: (Not a directory|File exists)"):
             BagWriter(path)
+    with pytest.raises(BagError, match="wanted a name in UTF-8"):
+        BagWriter(tmp_path / "\udcff")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is Linux's")

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 import sqlite3
 import struct
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -96,6 +100,69 @@ def test_log_that_a_killed_recorder_left_is_read(tmp_path: Path) -> None:
         shutil.copy(tmp_path / name, tmp_path / f"killed{name[4:]}")
     recorder.close()
     assert payloads(tmp_path / "killed.db3") == PAYLOADS[:5]
+
+
+def test_log_that_cannot_be_read_where_it_is_costs_nothing_else() -> None:
+    """SQLite makes a file beside it first: bags on a read-only disk, or of another user, weren't read at all."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = handmade(Path(folder, "live.db3"), messages=rows(0, 3))
+        recorder = sqlite3.connect(path)
+        recorder.execute("PRAGMA journal_mode = WAL")
+        recorder.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows(3, 5))
+        recorder.commit()
+        killed = Path(folder, "killed")
+        killed.mkdir()
+        for name in ("live.db3", "live.db3-wal"):
+            shutil.copy(Path(folder, name), killed)
+        recorder.close()
+        Path(folder).chmod(0o755)
+        killed.chmod(0o555)
+        is_root = os.geteuid() == 0
+        if is_root:  # who may write wherever permissions say no
+            os.setresuid(65534, 65534, 0)
+        try:
+            reader = BagReader(killed / "live.db3")
+            assert [message.data for message in reader.messages()] == PAYLOADS[:3]
+        finally:
+            if is_root:
+                os.setresuid(0, 0, 0)
+            killed.chmod(0o755)
+        assert "live.db3-wal is left out" in reader.warnings[0]
+
+
+def test_what_is_before_a_cut_is_read(tmp_path: Path) -> None:
+    """A copy that wasn't finished: SQLite doesn't open it unless it is told to."""
+    whole = handmade(tmp_path / "whole.db3", messages=rows(0, 12) * 100).read_bytes()
+    cut = tmp_path / "cut.db3"
+    cut.write_bytes(whole[: len(whole) // 2])
+    reader = BagReader(cut)
+    found = [message.data for message in reader.messages()]
+    assert found == (PAYLOADS * 100)[: len(found)]
+    assert len(found) > 400
+    assert "damaged" in reader.warnings[0]
+
+
+def test_messages_compressed_one_by_one_are_read(bag: Path, tmp_path: Path) -> None:
+    """As `ros2 bag record --compression-mode message` writes them, with their metadata and without."""
+    packed = [(1, START_NS + i, zstandard.compress(data)) for i, data in enumerate(PAYLOADS)]
+    bomb = zstandard.compress(bytes(200 << 20))
+    streamed = zstandard.ZstdCompressor(write_content_size=False).compress(PAYLOADS[0])
+    bad = [(1, START_NS, data) for data in (bomb, streamed, packed[0][2][:-9], packed[0][2][:5])]
+    path = handmade(tmp_path / "recorded.db3", messages=[*packed, *bad])
+    reader = BagReader(path)
+    assert [message.data for message in reader.messages()] == PAYLOADS
+    assert len(reader.warnings) == 4
+    assert "unpacks to 200 MiB" in reader.warnings[0]
+    metadata = (bag / "metadata.yaml").read_text()
+    for key, value in (("format", "zstd"), ("mode", "MESSAGE")):
+        metadata = re.sub(rf"compression_{key}: .*", f"compression_{key}: {value}", metadata)
+    (tmp_path / "metadata.yaml").write_text(metadata)
+    assert payloads(tmp_path) == PAYLOADS
+
+
+def test_a_name_that_is_no_text(tmp_path: Path) -> None:
+    plain = handmade(tmp_path / "plain.db3", messages=rows(0, 2))
+    assert payloads(plain.rename(tmp_path / "\udcff.db3")) == PAYLOADS[:2]
 
 
 def test_bad_rows_are_left_out(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from refu_core.keypoints import LAYOUTS, KeypointTracker, People, Proportions, S
 from refu_core.keypoints._pose import Pose, exp_so3, log_so3
 from refu_core.recordings._followed import SMPL_POINTS, follow
 from refu_core.skeleton import JOINT_NAMES
+from tests.torn import interrupts
 
 ROOT = Path(__file__).parents[2]
 MOTIONS = Path(os.environ.get("REFU_MOTIONS", "/nowhere"))
@@ -361,6 +362,28 @@ def test_a_clock_set_back_brings_nobody_back() -> None:
     assert people.at(9_000 * 10**9) == {}
     people.update("bob", points, confidence=None, stamp_ns=9_001 * 10**9, now_ns=9_001 * 10**9)
     assert set(people.at(9_001 * 10**9)) == {"bob"}
+
+
+def test_an_interrupt_leaves_the_track_as_it_was() -> None:
+    """It was half a step ahead: the same keypoints again gave a pose that was 40 mrad off, and so did the next ones."""
+    frames = clip("walk", 16).frames
+    points = [points_of(frame, "coco17") for frame in frames]
+
+    def begun(n: int) -> KeypointTracker:
+        track = KeypointTracker(skeleton("coco17"))
+        for frame, seen in zip(frames[:n], points, strict=False):
+            track.update(seen, frame.stamp_ns)
+        return track
+
+    for n in (0, 10):
+        known, torn = begun(n + 1), begun(n)
+        step = partial(torn.update, points[n], frames[n].stamp_ns)
+        assert sum(1 for _ in interrupts(step, "keypoints/_tracker")) > 30
+        for i in range(n + 1, n + 4):
+            got, wanted = (one.update(points[i], frames[i].stamp_ns) for one in (torn, known))
+            assert got is not None
+            assert wanted is not None
+            assert (got.pose == wanted.pose).all()
 
 
 def test_predictions_at_a_steady_rate() -> None:

@@ -14,6 +14,7 @@ from refu_core.observation import DEFAULT_OBSERVATION, Observer
 from refu_core.observation._cloth import Estimate
 from refu_core.outputs import Clearance, PinholeCamera, depth_image, visible
 from refu_lab.truth import TrueFrame, moments_of
+from tests.torn import interrupts
 
 BAG = Path(__file__).parents[2] / "bags" / "eval_short_pant_male"
 NAME = "short-pant-male"
@@ -158,6 +159,22 @@ def test_it_fades_and_stays_within_bounds(pipeline: GarmentPipeline, observer: O
     assert np.abs(observer(later)[NAME].local - plain).mean() < 0.2 * np.abs(wrong - plain).max()
     reset = SmplFrame(pose=np.zeros(72), stamp_ns=2_000_000_000)  # time runs back: another recording
     assert np.abs(observer(reset)[NAME].local - plain).max() < 1e-5
+
+
+def test_an_interrupt_leaves_what_was_learnt_as_it_was(pipeline: GarmentPipeline, observer: Observer) -> None:
+    """Time passed and points counted once more with each call that was interrupted, or the estimate was torn."""
+    frames = [SmplFrame(pose=np.zeros((24, 3)), stamp_ns=10**9 + i * 10**8) for i in range(3)]
+    goal = pipeline(frames[0])[NAME].local + np.array([0, 0, 0.008])
+    found = []
+    for is_torn in (False, True):
+        observer.reset()
+        observer(frames[0], goal)
+        if is_torn:
+            assert sum(1 for _ in interrupts(lambda: observer(frames[1], goal), "observation/")) > 30
+        else:
+            observer(frames[1], goal)
+        found.append(observer(frames[2])[NAME].local)
+    assert (found[0] == found[1]).all()
 
 
 def test_an_estimate_is_the_least_squares_of_prior_and_measurements() -> None:

@@ -40,8 +40,9 @@ def test_hostile_peers_do_not_end_it(ros: None, tmp_path: Path) -> None:  # noqa
         ({"record": "/"}, "record: wanted the path of a folder"),
         ({"betas": "[1.0,2]"}, "betas:=[1.0,2]"),
         ({"margin": "abc"}, "margin: wanted a number, got 'abc'"),
+        ({"threads": "x" * 5000}, "Trying to set parameter 'threads'"),  # rclpy's words, with the value
     ],
-    ids=["record", "betas", "margin"],
+    ids=["record", "betas", "margin", "threads"],
 )
 def test_a_bad_parameter_is_named_in_one_line(
     ros: None,  # noqa: ARG001
@@ -54,6 +55,7 @@ def test_a_bad_parameter_is_named_in_one_line(
         (line,) = node.log.splitlines()
         assert line.startswith("garment_node: error: ")
         assert words in line
+        assert len(line) < 330
 
 
 LOADS_FOREVER = """

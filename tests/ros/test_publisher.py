@@ -184,6 +184,7 @@ def test_ends_with_the_motion(context: Context) -> None:
         ({"persons": "[ann, é]"}, "persons: wanted distinct names"),
         ({"persons": "[ann, ann]"}, "persons: wanted distinct names"),
         ({"loop": 1}, "loop"),
+        ({"frame_id": "/map"}, "frame_id: wanted a name as tf2 has them"),  # which nobody could transform
         ({"input_axes": "left"}, "input_axes: wanted smpl or frame, got 'left'"),
     ],
     ids=lambda value: str(value),
