@@ -26,66 +26,56 @@ if "hypothesis" not in _MISSING:
     )
     settings.load_profile("refu")
 
+if importlib.util.find_spec("torch"):  # the adapters' tests run without it
+    import torch
+
+    torch.set_num_threads(1)  # as the node runs; and the figures of two test runs agree to the bit
+
 # What earlier tests left belongs to threads that a forked process hasn't got: destroyed there, it crashes.
 os.register_at_fork(after_in_child=gc.freeze)
 
 
 LONGEST = (
-    "core/test_fitting_places.py",
-    "lab/test_garment.py",
-    "ros/test_node_lazy.py",
-    "core/test_simulation.py",
-    "lab/test_evaluate.py",
-    "core/test_stability.py",
-    "test_style.py",
-    "ros/test_node_recording.py",
-    "test_arguments.py",
-    "core/test_fitting_files.py",
-    "core/test_training_backbone.py",
-    "lab/test_fleet.py",
-    "core/test_fitting.py",
-    "lab/test_view.py",
-    "ros/test_node_outputs.py",
-    "lab/test_stress.py",
-    "core/test_own_body.py",
-    "core/test_own_body_sizes.py",
-    "ros/test_node_requests.py",
     "lab/test_replay.py",
-    "lab/test_own_body_commands.py",
-    "core/test_threads.py",
-    "lab/test_train.py",
-    "ros/test_node_faults.py",
-    "lab/test_reproduction.py",
+    "test_style.py",
+    "ros/test_packaging.py",
+    "core/test_simulation.py",
+    "core/test_fitting_places.py",
+    "core/test_stability.py",
+    "ros/test_node_requests.py",
+    "lab/test_garment.py",
+    "lab/test_evaluate.py",
+    "core/test_training_backbone.py",
+    "ros/test_node_recording.py",
+    "lab/test_fleet.py",
     "core/test_kernel_bounds.py",
-    "core/test_outfits.py",
-    "core/test_training_refu.py",
+    "core/test_fitting_files.py",
+    "core/test_own_body.py",
+    "ros/test_node_outputs.py",
     "test_faults.py",
-    "core/test_graph.py",
-    "core/test_outputs_sigma.py",
-    "lab/test_benchmark.py",
-    "core/test_dynamics.py",
+    "ros/test_node.py",
+    "ros/test_node_lazy.py",
+    "core/test_training_refu.py",
+    "core/test_hostile_files.py",
+    "lab/test_own_body_commands.py",
+    "lab/test_stress.py",
+    "core/test_pipeline.py",
+    "core/test_fitting.py",
+    "lab/test_train.py",
+    "lab/test_reproduction.py",
     "core/test_assets.py",
-    "ros/test_node_crowd.py",
-    "ros/test_publisher.py",
-    "core/test_certificate.py",
-    "core/test_training_further.py",
+    "core/test_press.py",
     "core/test_kernel_cache.py",
+    "lab/test_benchmark.py",
+    "core/test_outfits.py",
+    "core/test_dynamics.py",
+    "core/test_graph.py",
+    "ros/test_node_life.py",
+    "ros/test_node_faults.py",
     "ros/test_node_stays_up.py",
     "fuzz/test_targets.py",
-    "core/test_beyond.py",
-    "core/test_layers.py",
-    "ros/test_node.py",
-    "core/test_simulation_sequences.py",
-    "core/test_outputs.py",
-    "lab/test_motion_inputs.py",
-    "ros/test_node_load.py",
-    "core/test_pipeline.py",
-    "adapters/test_bags.py",
-    "ros/test_packaging.py",
-    "test_guide.py",
-    "ros/test_live_view.py",
-    "core/test_training_carry.py",
     "test_node_parts.py",
+    "lab/test_view.py",
 )
 """Files of tests, the one that takes longest first: begun last, one of them would keep a single process busy while all
 others have nothing left to do."""
@@ -101,10 +91,6 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files that take long come first; the others, and the tests in each, stay in their order."""
-    if importlib.util.find_spec("torch"):  # the adapters' tests run without it
-        import torch  # not above: the process that only hands out tests needs none
-
-        torch.set_num_threads(1)  # as the node runs; and the figures of two test runs agree to the bit
     tests = Path(__file__).parent
     place = {tests / name: i for i, name in enumerate(LONGEST)}
     items.sort(key=lambda item: place.get(item.path, len(place)))
