@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 _MAX_TEXT = 300
 
 
@@ -64,3 +67,18 @@ class WeightsError(RefuError, ValueError):
 
 class SimulationError(RefuError, ValueError):
     """Motions, plans or data sets that don't fit together or can't be read."""
+
+
+@contextlib.contextmanager
+def as_before_if_it_fails(*changed: object) -> Iterator[None]:
+    """Whatever is raised in the block, an interrupt too, gives these objects back the attributes that they had.
+
+    What the attributes refer to must be replaced there, and not written to.
+    """
+    before = [vars(one).copy() for one in changed]
+    try:
+        yield
+    except BaseException:
+        for one, attributes in zip(changed, before, strict=True):
+            vars(one).update(attributes)
+        raise

@@ -47,12 +47,7 @@ def checked_numbers(
         if given.dtype.kind not in "iufO":  # NumPy also turns booleans, text, dates and complex ones into numbers
             raise TypeError(f"values of the type {given.dtype}")
         array = np.ma.filled(given.astype(np.float64), np.nan)
-    except (
-        TypeError,
-        ValueError,
-        RuntimeError,
-        OverflowError,
-    ) as error:  # such as a tensor that tracks gradients
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:  # RuntimeError: a tensor with gradients
         raise FrameError(f"{name} must be {shape} numbers, got {type(value).__name__}: {error}") from error
     size = math.prod(shape)
     if array.size != size or array.shape not in (shape, (size,)):

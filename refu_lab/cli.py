@@ -53,7 +53,7 @@ def _run(arguments: Sequence[str] | None) -> int:
         finally:  # after its help the parser ends the program
             print(end="", flush=True)
         try:
-            os.getcwd()  # noqa: PTH109
+            Path.cwd()
         except OSError as error:  # whatever needs it would name no file
             raise RefuError(f"the working directory is gone ({error.strerror}): cd to another") from error
         written = _outputs(args)

@@ -98,12 +98,10 @@ class PoseFeatures(nn.Module):
         """Which numbers of (features, β, γ) belong together, shape (size + 14,): those of one joint."""
         keep = torch.zeros(24, 1)
         keep[list(joints)] = 1.0
-        self.register_buffer("_index", torch.tensor((0, *self.joints)), persistent=False)
-        self.register_buffer("_joint", self._index.int(), persistent=False)
+        self.register_buffer("_index", torch.tensor((0, *self.joints), dtype=torch.int32), persistent=False)
         self.register_buffer("_keep", keep, persistent=False)
         self.register_buffer("_eye", torch.from_numpy(np.eye(3, dtype=np.float32)), persistent=False)
         self._index: Tensor
-        self._joint: Tensor
         self._keep: Tensor
         self._eye: Tensor
 
@@ -133,7 +131,7 @@ class PoseFeatures(nn.Module):
             return (whole * self._keep).flatten(1)
         if is_plain(pose):
             features = pose.new_empty(len(pose), self.size)
-            _see((len(pose), len(self._joint)), self._joint, pose.contiguous(), features)
+            _see((len(pose), len(self._index)), self._index, pose.contiguous(), features)
             return features
         rotations = rotvec_to_rotmat(pose[:, self._index])  # the root's first
         return torch.cat((told_up(up_in(rotations[:, 0])), (rotations[:, 1:] - self._eye).flatten(1)), 1)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from refu_core.errors import FrameError, require_type
+from refu_core.errors import FrameError, as_before_if_it_fails, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
 from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3
 from refu_core.keypoints._solver import (
@@ -96,12 +96,8 @@ class KeypointTracker:
         """
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
-        before = vars(self).copy()  # nothing in it is written to: it is replaced
-        try:
+        with as_before_if_it_fails(self):
             return self._updated(seen, stamp_ns)
-        except BaseException:
-            vars(self).update(before)
-            raise
 
     def _updated(self, seen: _Seen, stamp_ns: int) -> SmplFrame | None:
         dt = 1e-9 * (stamp_ns - self._stamp)

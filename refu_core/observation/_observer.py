@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core._warp import as_warp, ints
 from refu_core.body import blend_transforms
-from refu_core.errors import FrameError, require_type
+from refu_core.errors import FrameError, as_before_if_it_fails, require_type
 from refu_core.frames import SmplFrame
 from refu_core.observation._cloth import (
     DEFAULT_OBSERVATION,
@@ -78,15 +78,10 @@ class Observer:
         def adjust(dressed: Dressed) -> Dressed:
             return self._adjusted(dressed, measured - frame.transl, None if camera is None else camera - frame.transl)
 
-        changed = [self, *self._cloths.values(), *(cloth.estimate for cloth in self._cloths.values())]
-        before = [vars(one).copy() for one in changed]  # what a frame changes in it is replaced, not written to
-        try:
+        cloths = self._cloths.values()
+        with as_before_if_it_fails(self, *cloths, *(cloth.estimate for cloth in cloths)):
             self._wait(frame)
             return self._pipeline.adjusted(frame, adjust)
-        except BaseException:
-            for one, state in zip(changed, before, strict=True):
-                vars(one).update(state)
-            raise
 
     def _wait(self, frame: SmplFrame) -> None:
         seconds = self._settings.step
