@@ -46,14 +46,19 @@ class Beside:
 
 
 @wp.func
+def to_box(p: wp.vec3, parts: Parts, k: int) -> float:
+    """The distance from a point to a part's box [m]."""
+    return wp.length(wp.max(wp.max(parts.low[k] - p, p - parts.high[k]), wp.vec3()))
+
+
+@wp.func
 def beside(p: wp.vec3, parts: Parts, within: float, other: int, facing: wp.vec3, opposed: float) -> Beside:
     """The nearest part except `other` whose skin there faces against `facing`; the nearest of all if `other` is -1."""
     found = Beside()
     found.part = -1
     found.distance = within
     for k in range(parts.mesh.shape[0]):
-        out = wp.max(wp.max(parts.low[k] - p, p - parts.high[k]), wp.vec3())
-        if k != other and wp.length(out) < found.distance:
+        if k != other and to_box(p, parts, k) < found.distance:
             query = wp.mesh_query_point_no_sign(parts.mesh[k], p, found.distance)
             if query.result:
                 f = 3 * (parts.face_start[k] + query.face)
@@ -93,6 +98,16 @@ def pressed_kernel(
     p = points[i]
     pair[i] = -1
     depth[i] = 0.0
+    nearest, next_ = float(within), float(within)
+    for k in range(parts.mesh.shape[0]):
+        d = to_box(p, parts, k)
+        if d < nearest:
+            next_ = nearest
+            nearest = d
+        elif d < next_:
+            next_ = d
+    if nearest + next_ >= within:  # no two parts are near enough
+        return
     first = beside(p, parts, within, -1, wp.vec3(), opposed)
     if first.part < 0:
         return
