@@ -202,7 +202,7 @@ class Draper:
         piece = np.repeat(np.arange(len(counts)), counts)
         self.cloth = SimulatedCloth(self.topology, sdf, piece=piece, settings=self.settings.cloth)
         self._waist = self._waists()
-        self._untangle = Untangle(garment.mesh, sdf, margin=self.settings.cloth.margin)
+        self.untangled = Untangle(garment.mesh, sdf, margin=self.settings.cloth.margin)
         self._comfort = np.concatenate((COMFORT_POSES, CROOK_POSE[None]))
         self._canonical: tuple[bytes, F32, F32] | None = None
 
@@ -303,7 +303,7 @@ class Draper:
                 break
         for _ in range(s.careful_frames):
             speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
-        level = self._untangle(self.cloth.positions, body)
+        level = self.untangled(self.cloth.positions, body)
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
         turned = np.ascontiguousarray(root.apply(level.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
         return SettledDrape(turned, speed, self.cloth.stretch(level))

@@ -141,9 +141,10 @@ class SequencePlan:
         u = np.random.default_rng(self._key(1, slot % self.shapes)).random(N_BETAS)
         return truncated_normal(u, self.spread), np.zeros(N_STYLES, np.float32)
 
-    def motion(self, slot: int, clips: list[Clip]) -> DrawnMotion:
-        """The motion that a sequence shows. Raises `SimulationError` when no clip is long enough."""
-        return draw_motion(clips, self.n_frames, np.random.default_rng(self._key(2, slot)))
+    def motion(self, slot: int, clips: list[Clip], attempt: int = 0) -> DrawnMotion:
+        """The motion that a sequence tries to show. Raises `SimulationError` when no clip is long enough."""
+        key = self._key(2, slot, *([attempt] if attempt else []))
+        return draw_motion(clips, self.n_frames, np.random.default_rng(key))
 
 
 @dataclass(frozen=True)
@@ -154,6 +155,10 @@ class SequenceSettings(SimulationSettings):
     """Rate at which the cloth's velocity fades in the air, which moves with the body [1/s]."""
     rebuild_every: int = 10
     """Simulated frames after which the body's tree of triangles is built anew."""
+    pauses: int = 3
+    """Most simulated frames for which the body waits until cloth that is in it or in itself is out again."""
+    most_smoothing: float = 0.02
+    """A frame whose cloth would have to be smoothed by more than this isn't taken [m]; the sequence goes on."""
 
 
 class SequenceSimulator(Simulator):
@@ -183,27 +188,31 @@ class SequenceSimulator(Simulator):
         split = plan.split_of(slot)
         betas, style = plan.style_shape(slot)
         row: dict[str, Any] = {"slot": slot, "shape": slot % plan.shapes, "split": split, "betas": betas}
-        motion = plan.motion(slot, self.clips[split == TEST])
-        played = self._play(motion, betas, style)
+        for attempt in range(self.settings.attempts):
+            motion = plan.motion(slot, self.clips[split == TEST], attempt)
+            drape = self._draper.drape(motion.poses[0], betas, style)
+            body = self._draper.bodies(motion.poses[:1], betas)[0]
+            if self._examine(drape.vertices, body, stretch=drape.stretch)[0] is None:
+                break  # an arm that begins within the cloth would stay there
+        played = self._play(motion, drape.vertices, betas, style)
         row |= {"style": style, **played, "pose": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
         row |= {"clip": motion.clip, "start": motion.start, "mirrored": motion.mirrored}
         row |= {"dropped": np.bincount(played["cause"], minlength=len(CAUSES) + 1)[1:], "state": DONE}
         return row | {"seconds": time.perf_counter() - started}
 
-    def _play(self, motion: DrawnMotion, betas: F32, style: F32) -> dict[str, NDArray[Any]]:
+    def _play(self, motion: DrawnMotion, start: F32, betas: F32, style: F32) -> dict[str, NDArray[Any]]:
         """Garments (T, N, 3), causes, stretch and speed (T,) of a motion, by the names of their columns.
 
         The cloth is simulated in a frame of reference that moves with the root and doesn't turn. There, the body's
-        acceleration acts as gravity with the opposite sign, and the air is still. The cloth starts at rest in the first
-        pose.
+        acceleration acts as gravity with the opposite sign, and the air is still. The cloth starts at rest in
+        `start` (N, 3) [m].
         """
         s, cloth, poses = self.settings, self._draper.cloth, motion.poses
-        drape = self._draper.drape(poses[0], betas, style)
         bodies = np.concatenate([self._draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
-        self._draper.begin(drape.vertices, betas, style, bodies[0])
+        self._draper.begin(start, betas, style, bodies[0])
         gravity = (np.array([0, -GRAVITY, 0]) - motion.acceleration()).astype(np.float32)
         n = len(poses[::STEPS])
-        vertices = np.zeros((n, *drape.vertices.shape), np.int16)
+        vertices = np.zeros((n, *start.shape), np.int16)
         cause = np.full(n, 1 + CAUSES.index("unsettled"), np.uint8)
         stretch, speed = np.full((2, n), np.nan, np.float32)
         for k, body in enumerate(bodies):
@@ -217,10 +226,34 @@ class SequenceSimulator(Simulator):
                 break  # the cloth is lost, and with it the rest of the sequence
             if k % STEPS == 0:
                 t = k // STEPS
+                found, stored = self._freed(body, gravity[k])
+                if stored is None:
+                    break
+                vertices[t], cause[t] = stored, 0 if found is None else 1 + CAUSES.index(found)
                 stretch[t], speed[t] = cloth.stretch(), now  # a moving cloth may be fast: no limit on its speed
-                found, vertices[t] = self._examine(cloth.positions, body, stretch=float(stretch[t]))
-                cause[t] = 0 if found is None else 1 + CAUSES.index(found)
         return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
+
+    def _freed(self, body: F32, gravity: F32) -> tuple[str | None, Any]:
+        """Frees the cloth where it is in itself or in the body (V, 3) [m]; what `_examine` says of it then.
+
+        Cloth that has got through would stay there for the rest of the sequence, as contacts keep each vertex on the
+        side that it is on. So it is smoothed where it intersects itself. While that doesn't free it, the body waits and
+        the cloth is strongly damped. `gravity` is (3,) [m/s²].
+        """
+        cloth, s = self._draper.cloth, self.settings
+        for pause in range(s.pauses + 1):
+            if pause:
+                cloth.frame(body, body, gravity=gravity, drag=s.drape.drag[0], careful=True)
+                if not np.abs(cloth.positions).max() <= FARTHEST:
+                    return "unsettled", None
+            level = self._draper.untangled(cloth.positions, body)
+            found, stored = self._examine(level, body, stretch=cloth.stretch(level))
+            if found is None:
+                if np.linalg.norm(level - cloth.positions, axis=1).max() > s.most_smoothing:
+                    found, stored = self._examine(cloth.positions, body, stretch=cloth.stretch())
+                cloth.positions[:] = level
+                break
+        return found, stored
 
 
 def simulate_sequences(

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.body import load_body
 from refu_core.garments import load_garment
+from refu_core.sdf import exact_sdf
 from refu_core.simulation import (
     Clip,
     Draper,
@@ -35,8 +36,8 @@ from refu_core.simulation import (
 )
 from refu_core.simulation._drape import CANONICAL_POSE
 from refu_core.simulation._plan import TEST
-from refu_core.simulation._sequences import STEPS, draw_motion, n_steps
-from refu_core.simulation._store import FPS, SEQUENCES, TO_DO, Rows
+from refu_core.simulation._sequences import STEPS, SequenceSettings, SequenceSimulator, draw_motion, n_steps
+from refu_core.simulation._store import FPS, SEQUENCES, TO_DO, Rows, dequantise
 from refu_core.simulation._worker import Selector
 from refu_core.training._data import TakenAlong, read_samples
 from refu_lab.cli import main
@@ -163,6 +164,36 @@ def test_cloth_moves_on_and_lags(sequences: list[GarmentSequence]) -> None:
         rest = garment.rest(shape, torch.from_numpy(sequence.style)[None]).expand(FRAMES, -1, -1)
         beyond = vertices - garment.pose(rest, posed.transforms).numpy()
         assert np.linalg.norm(np.diff(beyond, axis=0), axis=2).max() > 0.003
+
+
+@pytest.mark.parametrize("is_in_body", [False, True])
+def test_cloth_that_got_through_is_brought_back(clips: Path, is_in_body: bool) -> None:
+    """Left where it is, it would stay there, and no later frame of the sequence could be taken."""
+    plan = SequencePlan(GARMENT, 2, shapes=1, seconds=SECONDS)
+    simulator = SequenceSimulator(plan, split_clips(load_clips(clips)), SequenceSettings(), None)
+    still = np.zeros(10, np.float32), np.zeros(4, np.float32)
+    positions, body = simulator._draper.canonical(*still)
+    simulator._draper.begin(positions, *still, body)
+    cloth, ring = simulator._draper.cloth, simulator.garment.mesh.ring
+    sdf = exact_sdf(simulator.body)
+    sdf.update(torch.from_numpy(body))
+    near = sdf.query(torch.from_numpy(positions))
+    vertex = int(near.distance.argmin())
+    if is_in_body:
+        cloth.positions[vertex] -= (near.distance[vertex] + 0.006).item() * near.gradient[vertex].numpy()
+    else:  # changes places with a neighbour's neighbour
+        around = np.split(ring.items, ring.start[1:-1])
+        other = next(v for u in around[vertex] for v in around[u] if v != vertex and v not in around[vertex])
+        cloth.positions[[vertex, other]] = positions[[other, vertex]]
+    before = cloth.positions.copy()
+    assert simulator._selector.cause(before, body) == ("body_collision" if is_in_body else "self_intersection")
+    found, stored = simulator._freed(body, np.array([0, -9.81, 0], np.float32))
+    assert simulator._selector.cause(cloth.positions, body) is None
+    moved = np.linalg.norm(cloth.positions - before, axis=1)
+    assert np.median(moved) < 0.002 < moved[vertex]
+    # What was smoothed by so much that it would be seen isn't taken.
+    assert (found is None) == (is_in_body or moved.max() <= simulator.settings.most_smoothing)
+    assert simulator._selector.cause(dequantise(stored), body) == found
 
 
 def arrays(path: Path) -> dict[str, NDArray[Any]]:
