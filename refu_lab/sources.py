@@ -109,6 +109,8 @@ def open_source(options: RecordingOptions, pipeline: GarmentPipeline | None = No
     input that can't be read, or with options that don't apply to it, and as `RecordingOptions.load_pipeline`.
     """
     load = cache(lambda: pipeline or options.load_pipeline())
+    if options.keypoints is not None and options.input_type not in adapters.KEYPOINT_TYPES:
+        raise RefuError(f"{options.input}: --keypoints goes with --input-type {' or '.join(adapters.KEYPOINT_TYPES)}")
     if options.input.suffix.lower() in SUFFIXES:
         if options.topic is not None or options.input_type is not None:
             what = "--topic" if options.topic is not None else "--input-type"
@@ -196,7 +198,7 @@ def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Ca
     """
     assert options.input_type is not None
     stream = adapters.InputStream(options.input_type)
-    stream.follow(body, options.keypoints, betas=options.known_betas)
+    stream.follow(body, options.keypoints or "zed38", betas=options.known_betas)
     followed = options.person
     others: dict[str, None] = {}
 

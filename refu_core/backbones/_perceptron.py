@@ -112,7 +112,7 @@ class StackedPerceptrons(_Standardised):
             self.weights.append(nn.Parameter(torch.empty(count, a, b).uniform_(-bound, bound)))
             self.biases.append(nn.Parameter(torch.empty(count, b).uniform_(-bound, bound)))
         self._is_serial = True  # where numbers may be read: not in a CUDA graph
-        self._known: dict[int, tuple[list[int], Tensor, tuple[list[Tensor], list[Tensor], Tensor]]] = {}
+        self._known: dict[int, tuple[list[int] | None, Tensor, tuple[list[Tensor], list[Tensor], Tensor]]] = {}
 
     def _take_in(self, count: int, at: int) -> None:
         first = self.weights[0].detach().mT
@@ -139,10 +139,11 @@ class StackedPerceptrons(_Standardised):
         is_serial = self._is_serial and not mixture.is_cuda
         if self.training or not is_serial or not is_plain(mixture, *tensors):
             return list(self.weights), list(self.biases), mixture
-        version = [one._version for one in (mixture, *tensors)]
+        is_counted = not any(one.is_inference() for one in (mixture, *tensors))  # else nothing says when they change
+        version = [one._version for one in (mixture, *tensors)] if is_counted else None
         known = self._known.get(id(mixture))
-        if known is None or known[0] != version:
-            (rows,) = torch.nonzero(mixture.amax(0) > _LEAST, as_tuple=True)
+        if known is None or version is None or known[0] != version:
+            (rows,) = torch.nonzero((mixture > _LEAST).any(0), as_tuple=True)
             weights, biases = ([one.detach()[rows] for one in some] for some in (self.weights, self.biases))
             if len(self._known) >= _MOST_MIXTURES:
                 self._known.clear()

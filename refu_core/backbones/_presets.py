@@ -151,7 +151,7 @@ def backbone_from_weights(weights: Weights, garment: GarmentTemplate, *, device:
     build = partial(build_backbone, config, template, basis=basis, pivots=tensors.get("pivots"))
     with naming(f"{weights.path}: doesn't fit {garment.name}"):
         module = build_for(tensors, build, shared="decoder.")
-    module = module.float().to(device).eval()
+    module = module.to(device).eval()
     with torch.no_grad():
         at_rest = module(memory(1, N_BETAS, device=device), memory(1, N_JOINTS, 3, device=device), None)
     offset = float(at_rest.abs().max())
@@ -185,7 +185,7 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
         raise WeightsError(msg)
     with naming(f"{stored.path}: doesn't fit {weights.path.name}"):
         dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
-    dynamics = dynamics.float().to(next(network.parameters()).device)
+    dynamics = dynamics.to(next(network.parameters()).device)
     return Dynamic(network, dynamics).eval().requires_grad_(False)
 
 
@@ -242,7 +242,7 @@ def with_beyond(network: Backbone, weights: Weights) -> Backbone:
         return network
     n = getattr(network, "decoder").n_vertices  # noqa: B009 - a trained one has it
     device = next(network.parameters()).device if isinstance(network, Module) else "cpu"
-    beyond = [_load_beyond(kind, weights, n).float().to(device) for kind in kinds]
+    beyond = [_load_beyond(kind, weights, n).to(device) for kind in kinds]
     return WithBeyond(network, beyond).eval().requires_grad_(False)
 
 

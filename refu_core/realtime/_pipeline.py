@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache, partial
-from numbers import Real
+from numbers import Integral, Real
 from os import PathLike
 from types import NoneType
 from typing import NoReturn, overload
@@ -37,6 +37,8 @@ from refu_core.sdf import require_outward
 
 _MOST_WEARERS = 64
 """How many persons' (β, γ) are remembered, those seen last; each takes about half a megabyte per garment."""
+_MOST_THREADS = 256
+"""Each has memory of its own from the start; a million would end the process."""
 
 
 class GarmentPipeline:
@@ -162,14 +164,14 @@ class GarmentPipeline:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
             BodyError: no such body, or one that isn't in metres, upright, facing forward, in the T-pose and closed.
             WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
-            RefuError: an unknown mode, margin or device, or fewer than one thread.
+            RefuError: an unknown mode, margin or device, or no such number of threads.
         """
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
         require_type(contact, ContactSettings, "ContactSettings")
-        require_type(threads, int, "a number of threads")
-        if threads < 1:
-            raise RefuError(f"wanted at least one thread, got {threads}")
+        require_type(threads, Integral, "a number of threads")
+        if not 1 <= threads <= _MOST_THREADS:
+            raise RefuError(f"wanted 1 to {_MOST_THREADS} threads, got {threads}")
         torch_device = checked_device(device)
         outfit = load_outfit(
             garments,

@@ -37,11 +37,11 @@ def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -
     config = weights.card.get("refu")
     if config is None:
         return None
-    tensors = {k[len(_PREFIX) :]: v.float() for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
+    tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
     with naming(f"{weights.path}: its ReFU layer doesn't fit its card"):
         refu = build_for(tensors, lambda: Refu.from_config(config))
         if not 0 <= refu.margin <= MAX_MARGIN or not 0 <= refu.config["least"] <= 1:
             got = f"{refu.margin:g} m and {refu.config['least']:g}"
             msg = f"wanted a margin of 0 to {MAX_MARGIN} m and a least scale of 0 to 1, got {got}; train it again"
             raise WeightsError(msg)
-    return refu.float().to(device)
+    return refu.to(device)

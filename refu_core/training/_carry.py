@@ -216,7 +216,7 @@ def _borne_out(carried: Tensor, truth: Tensor, controls: nets.Controls) -> Tenso
     common, own = (carried * truth).sum((0, 2)), (carried * carried).sum((0, 2))
     field = controls.matrix()
     near = field.clamp_min(0).T / field.clamp_min(0).sum(0)[:, None]
-    least = _DOUBT * own.mean() + torch.finfo().tiny
+    least = _DOUBT * own.mean() + torch.finfo(own.dtype).tiny
     return (field @ ((near @ common) / (near @ own + least))).clamp(0, 1)
 
 

@@ -53,7 +53,7 @@ def config_of_card(kind: type[Config], values: Any) -> Config:
 
 
 def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, shared: str = " ") -> Module:
-    """What `build` makes, loaded with `tensors`; those whose names begin with `shared` stay as `build` makes them.
+    """What `build` makes, in float32, loaded with `tensors`; it keeps those whose names begin with `shared`.
 
     It is first built without memory: a card may claim sizes that no machine can hold, and its tensors reveal that.
     Raises `WeightsError` where the module can't be built, or has other tensors.
@@ -68,7 +68,7 @@ def build_for(tensors: Mapping[str, Tensor], build: Callable[[], Module], *, sha
             msg = f"wanted {len(wanted)} tensors, got {len(got)}; {len(other)} are missing, surplus or of another "
             msg += f"shape, {other[0][:80]} for one"
             raise WeightsError(msg)
-        module = build()
+        module = build().float()  # torch builds it in the caller's default type, which may be coarser than `tensors`
         module.load_state_dict(dict(tensors), strict=False)
     except _WRONG as error:
         raise WeightsError(f"not the network that its card describes: {error}; train it again") from error

@@ -64,7 +64,7 @@ def in_steps(values: Tensor, dim: int | None = None) -> tuple[Tensor, Tensor]:
     """
     largest = values.abs().amax() if dim is None else values.abs().amax(dim, keepdim=True)
     step = (largest / _STEPS).bfloat16().float()
-    steps = (values / step.clamp_min(torch.finfo().tiny)).round().clamp(-_STEPS, _STEPS)
+    steps = (values / step.clamp_min(torch.finfo(step.dtype).tiny)).round().clamp(-_STEPS, _STEPS)
     return steps.to(torch.int8), step
 
 

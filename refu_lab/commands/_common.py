@@ -152,12 +152,8 @@ def out_bag(text: str) -> Path:
 
 def word(text: str) -> str:
     """Text that can be sent in a message."""
-    try:
-        text.encode()
-    except UnicodeError:
-        text = ""
-    if not text.isprintable() or not text:
-        raise argparse.ArgumentTypeError("wanted text without control characters")
+    if not text.isprintable() or not text:  # lone surrogates, which can't be encoded, aren't printable, either
+        raise argparse.ArgumentTypeError(f"wanted text without control characters, got {printable(text)!r}")
     return text
 
 

@@ -27,7 +27,7 @@ class RecordingOptions(DressOptions):
     input: Path
     topic: str | None = setting(None, "input topic, where a bag has several with SMPL parameters", metavar="NAME")
     input_type: str | None = setting(None, "type of the topic's messages", choices=(*INPUT_TYPES, *KEYPOINT_TYPES))
-    keypoints: str = setting("zed38", "which points of the body, with keypoints as input", choices=LAYOUTS)
+    keypoints: str | None = setting(None, "which points of the body, with keypoints as input (zed38)", choices=LAYOUTS)
     person: str | None = setting(None, "person to dress, where the input has several", metavar="NAME")
     input_axes: Axes = cli.axes_of("recorded", "those of the frame itself, left as they are")
     fps: float | None = cli.rate_of_files()

@@ -29,6 +29,8 @@ from refu_lab.interrupts import interruptible
 if TYPE_CHECKING:
     from distributed import Client, Future
 
+MOST_JOBS = 1024
+"""Processes on this machine. Each takes a core and half a gigabyte, and no Ctrl-C comes through while they start."""
 IN_FLIGHT = 4
 """Tasks submitted at a time for each process: enough that it never idles, few enough that results don't pile up."""
 CONNECT_S = 20.0
@@ -49,10 +51,13 @@ _LAST_WORDS_S = 1.0
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
     """The engine for `jobs` processes on this machine (None or 1: this one alone), or for a Dask scheduler's address.
 
-    Raises `FleetError`: Dask isn't installed, both were asked for, or there is no scheduler at the address.
+    Raises `FleetError`: Dask isn't installed, both or too many processes were asked for, or there is no scheduler at
+    the address.
     """
     if jobs is not None and scheduler is not None:
         raise FleetError("wanted either processes of this machine (--jobs) or a cluster (--scheduler), got both")
+    if jobs is not None and jobs > MOST_JOBS:
+        raise FleetError(f"wanted at most {MOST_JOBS} processes of this machine (--jobs), got {jobs}")
     if scheduler is None and (jobs is None or jobs == 1):
         yield InProcess()
         return

@@ -442,3 +442,10 @@ def test_a_processor_has_no_number_and_no_other_name() -> None:
     assert GarmentPipeline.load("tshirt-male", device="cpu:0").body.device == torch.device("cpu")
     with pytest.raises(RefuError, match="no device 'gpu': wanted cpu or cuda"):
         load_body("male", device="gpu")
+
+
+def test_a_number_of_threads_is_one_that_can_be_had() -> None:
+    assert GarmentPipeline.load("tshirt-male", threads=np.int64(2)).threads == 2  # type: ignore[arg-type]
+    for wrong in (0, 10**6):
+        with pytest.raises(RefuError, match=f"wanted 1 to 256 threads, got {wrong}"):
+            GarmentPipeline.load("tshirt-male", threads=wrong)

@@ -10,17 +10,18 @@ import pytest
 import torch
 import trimesh
 
-from refu_core import ExactSdf, GarmentPipeline, Resolver, SmplFrame
+from refu_core import ExactSdf, GarmentPipeline, Resolver, SmplFrame, Wearer, dress
 from refu_core.realtime import PipelineOutput
 from refu_core.sdf import BandSdf
+from refu_core.weights import in_steps
 from refu_lab.stress._frames import everyday
 
 Settings = Callable[[], contextlib.AbstractContextManager[object]]
 
 
 @contextlib.contextmanager
-def _float64() -> Iterator[None]:
-    torch.set_default_dtype(torch.float64)
+def _default(kind: torch.dtype) -> Iterator[None]:
+    torch.set_default_dtype(kind)
     try:
         yield
     finally:
@@ -30,7 +31,8 @@ def _float64() -> Iterator[None]:
 _SETTINGS = {
     "inference mode": torch.inference_mode,
     "autocast": lambda: torch.autocast("cpu", dtype=torch.bfloat16),
-    "default type": _float64,
+    "fine default type": lambda: _default(torch.float64),
+    "coarse default type": lambda: _default(torch.bfloat16),
     "default device": lambda: torch.device("meta"),
 }
 each_setting = pytest.mark.parametrize("settings", _SETTINGS.values(), ids=_SETTINGS)
@@ -68,7 +70,18 @@ def test_a_pipeline_gives_the_same(settings: Settings, loads_within: bool, plain
             np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("settings", [torch.inference_mode, _float64])
+def test_a_forward_pass_gives_the_same_in_inference_mode_and_nothing_for_nobody() -> None:
+    outfit, pose, betas = _load().outfit, 0.1 * torch.ones(2, 24, 3), torch.ones(2, 10)
+    wanted = dress(pose, Wearer.of(outfit, betas)).drapes
+    with torch.inference_mode():
+        got = dress(pose, Wearer.of(outfit, betas.clone())).drapes
+    none = dress(pose[:0], Wearer.of(outfit, betas[:0])).drapes
+    for name, drape in wanted.items():
+        assert torch.equal(got[name].vertices, drape.vertices)
+        assert none[name].vertices.shape == (0, *drape.vertices.shape[1:])
+
+
+@pytest.mark.parametrize("settings", [_SETTINGS[name] for name in ("inference mode", "fine default type")])
 @pytest.mark.parametrize("kind", [ExactSdf, BandSdf])
 def test_a_distance_and_a_resolver_give_the_same(settings: Settings, kind: type[ExactSdf] | type[BandSdf]) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
@@ -87,3 +100,12 @@ def test_a_distance_and_a_resolver_give_the_same(settings: Settings, kind: type[
         for one, other in zip(got, wanted, strict=True):
             assert one.dtype == torch.float32
             assert torch.equal(one, other)
+
+
+def test_weights_are_stored_the_same() -> None:
+    values = torch.tensor([[1e-3, -2e-3], [0.0, 0.0]])
+    wanted = in_steps(values, 1)
+    with _default(torch.float16):
+        got = in_steps(values, 1)
+    assert all(map(torch.equal, got, wanted))
+    assert wanted[0].tolist() == [[64, -127], [0, 0]]

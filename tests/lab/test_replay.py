@@ -392,6 +392,24 @@ def test_two_outputs_of_one_place_are_refused(tmp_path: Path, capsys: pytest.Cap
 
 
 @pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        (["--keypoints", "coco17"], "--keypoints goes with --input-type keypoint_poses or keypoint_markers"),
+        (["--jobs", "1000000"], "wanted at most 1024 processes of this machine (--jobs), got 1000000"),
+    ],
+)
+def test_options_that_do_nothing_or_too_much_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], wanted: str
+) -> None:
+    bags = [str(write_bag(tmp_path / f"{name}.mcap", motion(2), "multiarray")) for name in "ab"]
+    assert main(["replay", *(bags if "--jobs" in options else bags[:1]), *options]) == 2
+    assert wanted in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["replay", *bags, "--frame-id", ""])
+    assert "wanted text without control characters, got ''" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("name", "make", "options", "wanted"),
     [
         ("missing.mcap", lambda path: path, (), ("missing.mcap",)),
