@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, WORLD_FRAME, InputAxes
+from refu_core._files import expanded
 from refu_core.errors import printable
 from refu_core.keypoints import LAYOUTS
 from refu_core.options import DressOptions, SettingsError, Spec, check, fixed, setting, specs_of
@@ -91,11 +92,11 @@ class NodeSettings(DressOptions):
     max_distance: float = setting(
         0.0, "People farther from the origin of frame_id aren't dressed [m]; 0: no limit.", within=(0.0, 1e6)
     )
-    record: str = setting("", "Directory of a bag that inputs, garments and diagnostics are recorded to; empty: none.")
+    record: str = setting("", "Bag to record inputs, garments and diagnostics to; empty: none.", metavar="DIR")
     record_sync_period: float = fixed(
         1.0, "The most that a power cut can take from a recording [s]; 0: no promise.", within=(0.0, 3600.0)
     )
-    bags: str = fixed("", "Folder that requests (refu_msgs) may name bags in; empty: none.")
+    bags: str = fixed("", "Folder that requests (refu_msgs) may name bags in; empty: none.", metavar="DIR")
     lazy: bool = fixed(True, "Subscribe to the inputs only while an output has a subscriber, or is recorded.")
     autostart: bool = fixed(True, "Whether the node configures and activates itself.")
 
@@ -230,7 +231,8 @@ def _coerced(name: str, value: Any, spec: Spec) -> Any:
         hint = "an empty list" if kind is str else "whole numbers and decimals mixed; write all as decimals"
         hint = f": no value, or {hint}" if value is None and is_list else ""  # ROS turns these into None
         raise SettingsError(f"{name}: wanted {wanted}, got {value!r}{hint}")
-    return tuple(map(kind, items)) if is_list else kind(value)
+    convert = expanded if spec.is_path else kind
+    return tuple(map(convert, items)) if is_list else convert(value)
 
 
 def _is_of(kind: type, value: Any) -> bool:

@@ -30,7 +30,7 @@ class PublisherOptions:
     """The node's parameters: what is played, and how. Raises `SettingsError` for values that have no meaning."""
 
     motion: str = fixed(
-        "", "File of motion (docs/guide/inputs.md), .mcap, or rosbag2 directory to play; empty: a march on the spot."
+        "", "File of motion (docs/guide/inputs.md), .mcap or rosbag2 directory; empty: a march.", metavar="FILE"
     )
     input_type: str = fixed("multiarray", f"Message to send: {', '.join(INPUT_TYPES)}.")
     input_axes: str = fixed("smpl", "Axes that are sent: smpl (y up), or frame (as files have them).", choices=AXES)
