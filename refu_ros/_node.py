@@ -335,6 +335,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             node=self.get_fully_qualified_name().lstrip("/"),
             state=self._state,
             in_use=self._in_use,
+            expected=self._listener.expected,
             input_frame=self._listener.input_frame,
             is_untransformed=self._listener.is_untransformed,
             has_foreign_betas=self._listener.doubts.has_foreign_betas and not self.settings.betas_are_told,
