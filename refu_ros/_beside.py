@@ -175,7 +175,6 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
 
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""
-_INTERRUPTED = 130
 NOT_BEGUN = "cancelled before a frame was done"
 
 
@@ -223,7 +222,7 @@ class BagJob:
             with contextlib.suppress(OSError, ValueError):
                 result: dict[str, Any] = json.loads(self._result.read_bytes())
                 return result
-        if code in (_INTERRUPTED, -signal.SIGTERM):
+        if code in (130, -signal.SIGTERM):
             said = NOT_BEGUN
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import socket
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -37,7 +38,7 @@ class Situation:
     """Time since the inputs were subscribed to [s]; None where they aren't."""
     in_use: PipelineOptions | None = None
     expected: Mapping[str, float] = field(default_factory=dict)
-    """Who ought to be here with `follow_humans` (`""`: anybody), and for how long that has been known [s]."""
+    """Who ought to be here with `follow_humans` (`""`: anybody), and since when, on the steady clock [s]."""
     input_frame: str = ""
     """The sender's frame, where it isn't the markers'."""
     is_untransformed: bool = False
@@ -83,7 +84,7 @@ def _node(report: Report, _: NodeSettings, now: Situation) -> Judgement:
 def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
     recent, reasons, persons, silent_for = report.recent, report.reasons, now.persons, report.silent_for
     received, invalid, waited = recent["received"], recent["drop.invalid"], now.listening_for or 0.0
-    announced = [person for person, seconds in now.expected.items() if seconds > _FIRST_INPUT_S]
+    announced = [person for person, since in now.expected.items() if time.monotonic() > since + _FIRST_INPUT_S]
     expected = announced if settings.follow_humans else settings.persons
     missing = [person for person in expected if person not in persons]
     if settings.input_type == "keypoint_markers":  # people in them are called `<person>_<namespace>`

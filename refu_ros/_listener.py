@@ -61,8 +61,8 @@ class Listener:
         self._heard: dict[str, float] = {}
         """When somebody's message came last, on the steady clock [s]; of the same people as `_frames`."""
         self._tracked: set[str] | None = None
-        self._expected: dict[str, float] = {}
-        """Since when it is known of somebody that they are here, on the steady clock [s]; with `follow_humans`."""
+        self.expected: dict[str, float] = {}
+        """Who is here by what others tell (`""`: anybody), and since when, on the steady clock [s]; of humans."""
         self._topics: list[Any] = []
         """All that there were when they could last be named: rclpy can't while a peer has one that isn't UTF-8."""
         self._name_topics = node.guarded("names of topics", node.get_topic_names_and_types, lambda _: self._topics)
@@ -116,11 +116,6 @@ class Listener:
         named = [*self._bodies()] if self._settings.follow_humans else self._settings.persons
         return [*dict.fromkeys([*named, *(self.scene.persons if self.scene is not None else ())])]
 
-    @property
-    def expected(self) -> dict[str, float]:
-        """Whoever is here by what others tell, `""` for anybody, and for how long that has been known [s]."""
-        return {printable(name): time.monotonic() - since for name, since in self._expected.items()}
-
     def attend(self, *, is_wanted: bool) -> None:
         """Listens while somebody wants the output, and some seconds longer.
 
@@ -156,7 +151,7 @@ class Listener:
         self._inputs.clear()
         self._turns.clear()
         self._frames.clear()
-        self._expected.clear()
+        self.expected.clear()
         self.since = self._tracked = self._tf_asked_at = self._camera = None
         self._waiting, self.is_untransformed = adapters.MessageFilter(self._node.statistics, most=self.room), False
 
@@ -354,7 +349,7 @@ class Listener:
             self._node.statistics.drop("crowd", f"{len(bodies)} bodies, up to {self.room} are dressed")
             bodies.sort(key=lambda one: one[0] not in self._inputs)
         here = tracked if tracked is not None else [one[0] for one in bodies] or [""] * (not tells)
-        self._expected = {one: self._expected.get(one, time.monotonic()) for one in here}
+        self.expected = {one: self.expected.get(one, time.monotonic()) for one in map(printable, here)}
         return dict(bodies[: self.room])
 
     def _listen_to_tracked(self) -> None:

@@ -29,8 +29,7 @@ def require_names(persons: Sequence[str], frame_id: str) -> list[str]:
     if not all(map(_PERSON.fullmatch, named)) or len(set(persons)) < len(persons):
         raise SettingsError(f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}")
     if not _FRAME.fullmatch(frame_id):
-        msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {frame_id!r}"
-        raise SettingsError(msg)
+        raise SettingsError(f"frame_id: wanted a name as tf2 has them, no leading slash or spaces, got {frame_id!r}")
     return named
 
 
@@ -104,8 +103,7 @@ class NodeSettings(DressOptions):
         check(self)
         named = require_names(self.persons, self.frame_id)
         if not self.persons or (len(named) < len(self.persons) > 1):
-            msg = f"persons: wanted one person without a name, or names for all, got {list(self.persons)}"
-            raise SettingsError(msg)
+            raise SettingsError(f"persons: wanted one without a name, or names for all, got {list(self.persons)}")
         if self.follow_humans and self.input_type != "joint_state":
             msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
             raise SettingsError(msg)
