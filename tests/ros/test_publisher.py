@@ -131,6 +131,16 @@ def test_a_motion_may_be_at_home(context: Context, monkeypatch: pytest.MonkeyPat
     node.destroy_node()
 
 
+@pytest.mark.parametrize("is_simulated", [False, True])
+def test_who_waits_for_a_clock_says_so(
+    context: Context, capfd: pytest.CaptureFixture[str], *, is_simulated: bool
+) -> None:
+    """Without a /clock it sent nothing for ever, and said nothing of it."""
+    given = ros_arguments({"use_sim_time": str(is_simulated).lower()})
+    SmplPublisher(context=context, cli_args=given).destroy_node()
+    assert ("as soon as /clock runs" in capfd.readouterr().err) == is_simulated
+
+
 def test_persons_stand_apart_and_move_apart(context: Context, tmp_path: Path) -> None:
     listener = Listener(context, "joint_state", ("ann/smpl_params", "bob/smpl_params"))
     log, decode = tmp_path / "log.txt", adapters.decoder_for("joint_state").from_bytes
