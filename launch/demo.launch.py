@@ -73,7 +73,8 @@ def player(given: dict[str, str]) -> LaunchDescriptionEntity:
     end = ends_the_demo("the player has ended")
     sim_time = is_true(given["use_sim_time"])
     if given["bag"]:
-        command = ["ros2", "bag", "play", "--loop", *(["--clock"] if sim_time else []), given["bag"]]
+        bag = str(Path(given["bag"]).expanduser())
+        command = ["ros2", "bag", "play", "--loop", *(["--clock"] if sim_time else []), bag]
         return ExecuteProcess(cmd=command, output="screen", on_exit=end)
     persons = [name for name in yaml.safe_load(given["persons"] or "[]") if name]
     remappings = [("smpl_params", given["input_topic"])] if given["input_topic"] else []

@@ -58,7 +58,7 @@ def node(context: LaunchContext) -> list[LifecycleNode]:
             name="garment_node",
             namespace=LaunchConfiguration("namespace"),
             parameters=[
-                LaunchConfiguration("params_file"),
+                str(Path(LaunchConfiguration("params_file").perform(context)).expanduser()),
                 {name: parsed(name, text) for name, text in given.items() if text and name not in TOPICS},
             ],
             remappings=[(topic, given[name]) for name, topic in TOPICS.items() if given[name]],

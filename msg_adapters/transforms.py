@@ -28,6 +28,8 @@ _LONGEST_NAME = 255
 """Of a frame [characters], as in the node's parameter: names of a megabyte each would fill the memory."""
 _LONGEST_WAY = 100
 """Longest chain of parents. Robots have a few dozen; the chain is followed anew for each input."""
+_SET_BACK_NS = 10**9
+"""A frame's transform this much older than the one before tells that time was set back, before `/clock` does [ns]."""
 _UNIT_TOLERANCE = 1e-2
 """How far a quaternion's length may be from 1, as in tf2."""
 _DISCOVERY_S = 1.0
@@ -112,6 +114,10 @@ class _Track:
     stamps: list[int] = field(default_factory=list)
     values: list[NDArray[np.float64]] = field(default_factory=list)
     """Translation and quaternion, shape (7,) each."""
+    came: float = 0.0
+    """When the newest came, by the buffer's clock [s]."""
+    set_back: float = -math.inf
+    """When time was set back, as these tell [s]: what came of other frames before is of another time."""
 
     def put(self, stamp_ns: int, value: NDArray[np.float64], *, most: int) -> None:
         # A transform with an older stamp replaces all later ones: a simulation was reset, or a bag begins again.
@@ -203,9 +209,12 @@ class TransformBuffer:
             return f"which is no rotation: wanted a quaternion of length 1, got {length:.3g}"
         if child not in self._tracks and self.is_full:
             return f"which would be more than {len(self)} frames"
-        track = self._tracks.get(child)
+        track, now = self._tracks.get(child), self._clock()
         if track is None or track.parent != parent or track.is_static != is_static:
             track = self._tracks[child] = _Track(parent, is_static)
+        elif not is_static and stamp_ns < track.stamps[-1] - _SET_BACK_NS:
+            track.set_back = now
+        track.came = now
         track.put(stamp_ns, value.copy(), most=min(_MOST_OWN, _MOST_STAMPS // len(self)))
         self._heard.add(child)
         return ""
@@ -253,6 +262,11 @@ class TransformBuffer:
             hint = f", none has come: start what sends /tf, or set frame_id to {source} if they are the same place"
             what = f"no transform leads from {source or 'a frame without a name'} to {target}"
             raise TransformError(what + hint * (not self._tracks))
+        moving = {child: track for child in (*up, *down) if not (track := self._tracks[child]).is_static}
+        set_back = max((track.set_back for track in moving.values()), default=0.0)
+        since = set_back - _DISCOVERY_S  # one after the other they tell of the same
+        if late := [child for child, one in moving.items() if one.came < set_back and one.set_back < since]:
+            raise TransformError(f"time was set back, and no transform of {late[0]} has come since")
         return up, down
 
     def _way(self, frame: str) -> list[str]:

@@ -42,6 +42,14 @@ def keep_streams() -> None:
             setattr(sys, name, os.fdopen(number, "w"))
 
 
+def expanded(path: str) -> str:
+    """The path with a home in place of `~` or `~user`; as it is where there is no such user."""
+    try:
+        return os.path.expanduser(path)  # noqa: PTH111 - Path's raises, and takes the `./` off a file called ~x
+    except ValueError:  # a user whose name no system takes
+        return path
+
+
 class _Sized(io.FileIO):
     """A file that ends at its size when it was opened, even if it grows."""
 

@@ -46,9 +46,14 @@ class Spec:
     live: bool = True
     """Whether it may change while a node runs."""
     metavar: str = ""
-    """Stands for the value in a command's help; FILE and DIR for paths."""
+    """Stands for the value in a command's help; FILE and DIR for paths, A,B for names or paths."""
     parse: Callable[[str], Any] | None = None
     """Parses the text that a command was given, where the default doesn't tell the type."""
+
+    @property
+    def is_path(self) -> bool:
+        """Whether the value, or a list's items, may be paths: `~` is a home in them."""
+        return self.metavar in ("FILE", "DIR", "A,B")
 
     @property
     def kind(self) -> type:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from msg_adapters import KEYPOINT_TYPES, check_plausible
 from msg_adapters.axes import ros_from_sender, up_of_sender
 from refu_core import RefuError, SmplFrame
+from refu_core._files import expanded
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.modes import BUILTIN_GARMENTS
 from refu_core.options import PIPELINE_OPTIONS, PipelineOptions, arguments
@@ -41,9 +41,6 @@ Use = Callable[["Fittings", PipelineOptions], object]
 Fail = Callable[[Exception, PipelineOptions], object]
 Then = Callable[["PipelineOutput", dict[str, NDArray[np.float64]]], object]
 
-_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-"""Name of a folder or file: not hidden, not `..`, not an option of a command."""
-_MOST_PARTS = 8
 _MOST_GARMENTS = 16
 _MOST_WAITING = 8
 """Requests that may wait: anyone who asks faster than frames can be dressed is told so."""
@@ -165,7 +162,7 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
 
     Garments are files: a request may name those that ship and those the operator has chosen, but no path.
     """
-    names, sdf = tuple(request.garments[:_MOST_GARMENTS]), request.sdf or settings.sdf
+    names, sdf = tuple(map(expanded, request.garments[:_MOST_GARMENTS])), request.sdf or settings.sdf
     known = list(dict.fromkeys([*settings.garments, *BUILTIN_GARMENTS]))
     if unknown := [name for name in names if name not in known] or request.garments[_MOST_GARMENTS:]:
         raise RefuError(f"garments: wanted up to {_MOST_GARMENTS} of {', '.join(known)}, got {unknown[0]!r}")
@@ -176,23 +173,8 @@ def asked_settings(request: Any, settings: NodeSettings) -> NodeSettings:
     return asked
 
 
-def asked_path(settings: NodeSettings, name: str) -> Path:
-    """A path below the folder in the parameter `bags`. Raises `RefuError` for any other, links out of it included."""
-    if not settings.bags:
-        raise RefuError("a request may name no file: start the node with the parameter bags, a folder for them")
-    parts = name.split("/")
-    # Path.resolve raises for links that lead in a circle; here they stay links.
-    folder = Path(os.path.realpath(Path(settings.bags).expanduser()))
-    if len(parts) <= _MOST_PARTS and all(map(_PART.fullmatch, parts)):
-        path = Path(os.path.realpath(folder / name))
-        if folder in path.parents and not path.is_symlink():
-            return path
-    raise RefuError(f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}")
-
-
 _PATIENCE_S = 10.0
 """Time for a bag to be closed when its replay is ended [s]."""
-_INTERRUPTED = 130
 NOT_BEGUN = "cancelled before a frame was done"
 
 
@@ -240,7 +222,7 @@ class BagJob:
             with contextlib.suppress(OSError, ValueError):
                 result: dict[str, Any] = json.loads(self._result.read_bytes())
                 return result
-        if code in (_INTERRUPTED, -signal.SIGTERM):
+        if code in (130, -signal.SIGTERM):
             said = NOT_BEGUN
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
 

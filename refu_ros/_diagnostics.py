@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import socket
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from msg_adapters import DiagnosticStatus
 from msg_adapters.bags import RecorderState
@@ -36,6 +37,8 @@ class Situation:
     listening_for: float | None = math.inf
     """Time since the inputs were subscribed to [s]; None where they aren't."""
     in_use: PipelineOptions | None = None
+    expected: Mapping[str, float] = field(default_factory=dict)
+    """Who ought to be here with `follow_humans` (`""`: anybody), and since when, on the steady clock [s]."""
     input_frame: str = ""
     """The sender's frame, where it isn't the markers'."""
     is_untransformed: bool = False
@@ -81,7 +84,9 @@ def _node(report: Report, _: NodeSettings, now: Situation) -> Judgement:
 def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
     recent, reasons, persons, silent_for = report.recent, report.reasons, now.persons, report.silent_for
     received, invalid, waited = recent["received"], recent["drop.invalid"], now.listening_for or 0.0
-    missing = [] if settings.follow_humans else [person for person in settings.persons if person not in persons]
+    announced = [person for person, since in now.expected.items() if time.monotonic() > since + _FIRST_INPUT_S]
+    expected = announced if settings.follow_humans else settings.persons
+    missing = [person for person in expected if person not in persons]
     if settings.input_type == "keypoint_markers":  # people in them are called `<person>_<namespace>`
         missing = [name for name in missing if not any(one.startswith(f"{name}_" if name else "") for one in persons)]
     who = ", ".join(filter(None, missing)) or f"{min(silent_for or 0.0, waited):.1f} s"

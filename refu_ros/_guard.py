@@ -85,10 +85,15 @@ class GuardedNode(Node):  # type: ignore[misc]
     def add_waitable(self, waitable: Any) -> None:
         """Like rclpy's, but guarded, for actions and for the events of publishers and subscriptions.
 
-        An event may still be queued when its publisher or subscription is destroyed. Then there is nothing left to
-        take, and the C++ executor would raise.
+        An event may still be queued, or about to be waited for by another thread, when its publisher or subscription is
+        destroyed. Then there is nothing left to take, and the executor would raise.
         """
-        take = waitable.take_data
+        take, add = waitable.take_data, waitable.add_to_wait_set
+
+        def add_to_wait_set(wait_set: Any) -> None:
+            waitable._event_index = None  # of the wait set before
+            with suppress(InvalidHandle):
+                add(wait_set)
 
         def take_data() -> Any:
             with suppress(InvalidHandle):
@@ -97,7 +102,7 @@ class GuardedNode(Node):  # type: ignore[misc]
         if isinstance(waitable, ActionServer):
             waitable.take_data = self.guarded("action", take, lambda *_: {})
         else:
-            waitable.callback = self.guarded("event", waitable.callback)
+            waitable.callback, waitable.add_to_wait_set = self.guarded("event", waitable.callback), add_to_wait_set
             waitable.take_data = self.guarded("event", take_data)
         super().add_waitable(waitable)
 

@@ -61,6 +61,8 @@ class Listener:
         self._heard: dict[str, float] = {}
         """When somebody's message came last, on the steady clock [s]; of the same people as `_frames`."""
         self._tracked: set[str] | None = None
+        self.expected: dict[str, float] = {}
+        """Who is here by what others tell (`""`: anybody), and since when, on the steady clock [s]; of humans."""
         self._topics: list[Any] = []
         """All that there were when they could last be named: rclpy can't while a peer has one that isn't UTF-8."""
         self._name_topics = node.guarded("names of topics", node.get_topic_names_and_types, lambda _: self._topics)
@@ -149,6 +151,7 @@ class Listener:
         self._inputs.clear()
         self._turns.clear()
         self._frames.clear()
+        self.expected.clear()
         self.since = self._tracked = self._tf_asked_at = self._camera = None
         self._waiting, self.is_untransformed = adapters.MessageFilter(self._node.statistics, most=self.room), False
 
@@ -338,13 +341,15 @@ class Listener:
     def _bodies(self) -> dict[str, str]:
         """The topic of each body that there is: of those announced as tracked, or of all if nothing is announced."""
         self._topics, count = self._name_topics(), self._node.count_publishers
-        told = self._inputs.get(_TRACKED)  # who announced people and has gone doesn't know who comes
-        tracked = self._tracked if told is not None and count(told.topic_name) else None
+        tells = count(self._node.resolve_topic_name(_TRACKED))
+        tracked = self._tracked if tells else None  # who announced people and has gone doesn't know who comes
         found = ((match[1], topic) for topic, _ in self._topics if (match := _HUMANS.fullmatch(topic)))
         bodies = [one for one in found if (tracked is None or one[0] in tracked) and count(one[1])]
         if len(bodies) > self.room:
             self._node.statistics.drop("crowd", f"{len(bodies)} bodies, up to {self.room} are dressed")
             bodies.sort(key=lambda one: one[0] not in self._inputs)
+        here = tracked if tracked is not None else [one[0] for one in bodies] or [""] * (not tells)
+        self.expected = {one: self.expected.get(one, time.monotonic()) for one in map(printable, here)}
         return dict(bodies[: self.room])
 
     def _listen_to_tracked(self) -> None:

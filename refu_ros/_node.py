@@ -76,6 +76,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._on_parameters)
         for beat in (self._look_after, self._report):  # what fails in one must not keep the other from its work
             self.create_timer(_BEAT_S, self.guarded("each second", beat), clock=steady)
+        self._rest = self.create_timer(0.0, self.guarded("topics", self._hold_topics), clock=steady)
+        self._rest.cancel()
         if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
             self.create_timer(1 / self.settings.keypoint_rate, predict, clock=steady)
@@ -203,12 +205,13 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _hold_topics(self) -> None:
         """Keeps the publishers for everybody who may come, in what they wear."""
+        self._rest.cancel()
         if self._worker is None:  # it was deactivated meanwhile
             return
         persons, fittings = self._listener.persons, self._worker.fittings
         wanted = {topic: one.message_type for one in self._outputs for topic in one.topics(persons, fittings)}
-        if not self._bank.hold(wanted, until=time.monotonic() + TURN_S) and self.executor is not None:
-            self.executor.create_task(self._hold_topics)
+        if not self._bank.hold(wanted, until=time.monotonic() + TURN_S):
+            self._rest.reset()
 
     def device_lost(self, reason: str) -> None:
         """Goes on on the CPU, or ends, as `on_device_loss` says."""
@@ -267,7 +270,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
     def _on_loaded(self, *new: Any) -> None:
         self._loaded.append(new)
         if (executor := self.executor) is not None:  # it has none before it spins, nor after
-            executor.create_task(self._take_over)
+            executor.create_task(self.guarded("loaded", self._take_over))
 
     def _take_over(self) -> None:
         if not self._loaded:
@@ -335,6 +338,7 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
             node=self.get_fully_qualified_name().lstrip("/"),
             state=self._state,
             in_use=self._in_use,
+            expected=self._listener.expected,
             input_frame=self._listener.input_frame,
             is_untransformed=self._listener.is_untransformed,
             has_foreign_betas=self._listener.doubts.has_foreign_betas and not self.settings.betas_are_told,

@@ -19,10 +19,10 @@ from rclpy.serialization import deserialize_message
 from rclpy.task import Future as RosFuture
 
 from msg_adapters import MESH, encode_mesh
-from msg_adapters.bags import free_path
+from msg_adapters.bags import free_path, path_in
 from refu_core import RefuError
 from refu_core.errors import printable
-from refu_ros._beside import NOT_BEGUN, BagJob, RequestDresser, asked_frame, asked_path, asked_settings
+from refu_ros._beside import NOT_BEGUN, BagJob, RequestDresser, asked_frame, asked_settings
 from refu_ros._guard import answer_no
 from refu_ros._interfaces import interface
 
@@ -75,7 +75,7 @@ class Requests:
         return response
 
     def _on_record(self, request: Any, response: Any) -> Any:
-        path = str(asked_path(self._node.settings, request.path)) if request.path else ""
+        path = str(path_in(self._node.settings.bags, request.path)) if request.path else ""
         response.message, response.path = self._node.record(on=request.start, path=path)
         response.success = True
         return response
@@ -142,7 +142,7 @@ class Requests:
         if self._job is not None:
             raise RefuError("another bag is being dressed: wait for it, or cancel it")
         settings = asked_settings(request, self._node.settings)
-        bag = asked_path(settings, request.bag)
+        bag = path_in(settings.bags, request.bag)
         if not bag.exists():
             raise RefuError(f"no bag {request.bag!r} in {settings.bags}")
         output = free_path(bag.with_name(f"{bag.stem}-dressed.mcap"))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from msg_adapters import INPUT_TYPES, KEYPOINT_TYPES, POINT_FIELDS, WORLD_FRAME, InputAxes
+from refu_core._files import expanded
 from refu_core.errors import printable
 from refu_core.keypoints import LAYOUTS
 from refu_core.options import DressOptions, SettingsError, Spec, check, fixed, setting, specs_of
@@ -28,8 +29,7 @@ def require_names(persons: Sequence[str], frame_id: str) -> list[str]:
     if not all(map(_PERSON.fullmatch, named)) or len(set(persons)) < len(persons):
         raise SettingsError(f"persons: wanted distinct names of letters, digits and underscores, got {list(persons)}")
     if not _FRAME.fullmatch(frame_id):
-        msg = f"frame_id: wanted a name as tf2 has them, without a leading slash or spaces, got {frame_id!r}"
-        raise SettingsError(msg)
+        raise SettingsError(f"frame_id: wanted a name as tf2 has them, no leading slash or spaces, got {frame_id!r}")
     return named
 
 
@@ -91,11 +91,11 @@ class NodeSettings(DressOptions):
     max_distance: float = setting(
         0.0, "People farther from the origin of frame_id aren't dressed [m]; 0: no limit.", within=(0.0, 1e6)
     )
-    record: str = setting("", "Directory of a bag that inputs, garments and diagnostics are recorded to; empty: none.")
+    record: str = setting("", "Bag to record inputs, garments and diagnostics to; empty: none.", metavar="DIR")
     record_sync_period: float = fixed(
         1.0, "The most that a power cut can take from a recording [s]; 0: no promise.", within=(0.0, 3600.0)
     )
-    bags: str = fixed("", "Folder that requests (refu_msgs) may name bags in; empty: none.")
+    bags: str = fixed("", "Folder that requests (refu_msgs) may name bags in; empty: none.", metavar="DIR")
     lazy: bool = fixed(True, "Subscribe to the inputs only while an output has a subscriber, or is recorded.")
     autostart: bool = fixed(True, "Whether the node configures and activates itself.")
 
@@ -103,8 +103,7 @@ class NodeSettings(DressOptions):
         check(self)
         named = require_names(self.persons, self.frame_id)
         if not self.persons or (len(named) < len(self.persons) > 1):
-            msg = f"persons: wanted one person without a name, or names for all, got {list(self.persons)}"
-            raise SettingsError(msg)
+            raise SettingsError(f"persons: wanted one without a name, or names for all, got {list(self.persons)}")
         if self.follow_humans and self.input_type != "joint_state":
             msg = f"follow_humans: REP-155 has bodies as joint_state, but input_type is {self.input_type}"
             raise SettingsError(msg)
@@ -230,7 +229,8 @@ def _coerced(name: str, value: Any, spec: Spec) -> Any:
         hint = "an empty list" if kind is str else "whole numbers and decimals mixed; write all as decimals"
         hint = f": no value, or {hint}" if value is None and is_list else ""  # ROS turns these into None
         raise SettingsError(f"{name}: wanted {wanted}, got {value!r}{hint}")
-    return tuple(map(kind, items)) if is_list else kind(value)
+    convert = expanded if spec.is_path else kind
+    return tuple(map(convert, items)) if is_list else convert(value)
 
 
 def _is_of(kind: type, value: Any) -> bool:

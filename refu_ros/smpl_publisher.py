@@ -30,7 +30,7 @@ class PublisherOptions:
     """The node's parameters: what is played, and how. Raises `SettingsError` for values that have no meaning."""
 
     motion: str = fixed(
-        "", "File of motion (docs/guide/inputs.md), .mcap, or rosbag2 directory to play; empty: a march on the spot."
+        "", "File of motion (docs/guide/inputs.md), .mcap or rosbag2 directory; empty: a march.", metavar="FILE"
     )
     input_type: str = fixed("multiarray", f"Message to send: {', '.join(INPUT_TYPES)}.")
     input_axes: str = fixed("smpl", "Axes that are sent: smpl (y up), or frame (as files have them).", choices=AXES)
@@ -82,6 +82,7 @@ class SmplPublisher(GuardedNode):
         self.get_logger().info(
             f"{self.options.motion or 'march on the spot'}: {len(self.motion)} frames at {self.motion.fps:g} Hz as "
             f"{message_type} on {', '.join(output.topic_name for output in self._outputs)}"
+            f"{', as soon as /clock runs (use_sim_time)' * bool(self.get_parameter('use_sim_time').value)}"
         )
 
     def _tick(self) -> None:
@@ -90,9 +91,8 @@ class SmplPublisher(GuardedNode):
             return
         stamp_ns = self.get_clock().now().nanoseconds
         for i, output in enumerate(self._outputs):
-            start = i * len(self.motion) // len(self._outputs)
             try:
-                frame = self.motion.frame((self._index + start) % len(self.motion))
+                frame = self.motion.frame((self._index + i * len(self.motion) // len(self._outputs)) % len(self.motion))
             except FrameError as error:  # recordings have such frames; what is sent is always a person
                 self.get_logger().warning(f"{self.motion.source}: frame left out: {error}", throttle_duration_sec=5.0)
                 continue

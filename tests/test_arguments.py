@@ -85,6 +85,24 @@ def test_names_that_no_file_has(command: str, option: str, name: str, capsys: py
     assert f"argument {option}: wanted a path" in refused([*NEEDED[command], option, name], capsys)
 
 
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--json=~/folder", "wanted a file"),
+        ("--body=~/x.npz", "{}/x.npz"),
+        ("--garments=tshirt-male,~/x.npz", "{}/x.npz"),
+        ("--weights=~/x", "{}/x"),
+    ],
+)
+def test_a_tilde_is_a_home_where_the_shell_leaves_it(
+    option: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As bash does after `--option=`: a folder called ~ was made, or nothing was found."""
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert said.format(tmp_path) in refused(["replay", BAG, option], capsys)
+
+
 def test_a_working_directory_that_was_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,6 +9,7 @@ from msg_adapters.bags._recorder import Recorder as Recorder
 from msg_adapters.bags._recorder import RecorderState as RecorderState
 from msg_adapters.bags._recorder import RunningRecording as RunningRecording
 from msg_adapters.bags._recorder import free_path as free_path
+from msg_adapters.bags._recorder import path_in as path_in
 from msg_adapters.bags._smpl import FrameRecord as FrameRecord
 from msg_adapters.bags._smpl import SmplBag as SmplBag
 from msg_adapters.bags._smpl import iter_smpl_frames as iter_smpl_frames

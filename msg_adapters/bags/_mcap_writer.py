@@ -70,6 +70,8 @@ class McapWriter:
         by the next call that waits for it."""
         self.whole = 0
         """Where the last complete record ends [bytes]."""
+        self.n_whole = 0
+        """Messages before that: those in complete chunks."""
         self._stream = stream
         self._chunk_bytes = chunk_bytes
         self._packer = zstandard.ZstdCompressor(level=_LEVEL)
@@ -197,6 +199,7 @@ class McapWriter:
             places[channel] = at
             at += len(index)
         self._write(b"".join(indexes))
+        self.n_whole += len(chunk.times)
         where = times + struct.pack("<QQ", start, end - start) + _number_map(places) + struct.pack("<Q", at - end)
         sizes = struct.pack("<QQ", len(packed), len(records))
         self._chunk_indexes.append(_record(CHUNK_INDEX, where, _text("zstd"), sizes))

@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -104,6 +105,11 @@ class BagReader:
             return [self.path]
         if os.path.lexists(self.path / METADATA_FILE):
             files = read_file_paths(self.path)
+            with suppress(OSError):
+                others = sorted(one.name for one in {*filter(_is_of_bag, self.path.iterdir())} - {*files})
+                if others:
+                    named = f"{others[0]}{f' and {len(others) - 1} more' * (len(others) > 1)}"
+                    self._notes.append(printable(f"{self.path}: {METADATA_FILE} doesn't list {named}: not read"))
         else:
             try:
                 files = sorted(filter(_is_of_bag, self.path.iterdir()), key=_by_number)

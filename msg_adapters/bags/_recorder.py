@@ -5,6 +5,8 @@ from __future__ import annotations
 import atexit
 import itertools
 import math
+import os
+import re
 import shutil
 import threading
 import time
@@ -24,6 +26,10 @@ from refu_core.errors import printable
 _MAX_QUEUED_MESSAGES = 10_000
 _MOST_TOPICS = 10_000
 """In one bag: people's topics come and go, and running out of MCAP's 16-bit numbers would end the recording."""
+
+_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+"""Name of a folder or file: not hidden, not `..`, not an option of a command."""
+_MOST_PARTS = 8
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,21 @@ def free_path(path: Path) -> Path:
 
 def _is_of_bag(file: Path) -> bool:
     return file.is_file() and (file.name == METADATA_FILE or file.suffix in BAG_SUFFIXES)
+
+
+def path_in(folder: str, name: str) -> Path:
+    """The path of that name below the folder in the node's parameter `bags`; the name may be anybody's.
+
+    Raises `BagError` for any other path, links out of the folder included, and where there is no folder.
+    """
+    if not folder:
+        raise BagError("a request may name no file: start the node with the parameter bags, a folder for them")
+    parts, top = name.split("/"), Path(os.path.realpath(folder))  # Path.resolve raises for links that go in a circle
+    if len(parts) <= _MOST_PARTS and all(map(_PART.fullmatch, parts)):
+        path = Path(os.path.realpath(top / name))
+        if top in path.parents and not path.is_symlink():
+            return path
+    raise BagError(f"wanted a path below the parameter bags, as today/walk.mcap, got {name!r}")
 
 
 def _opened(path: Path, open_bag: Callable[[Path], BagWriter]) -> tuple[Path, BagWriter]:
@@ -200,6 +221,7 @@ class Recorder:
             )
 
     def _run(self) -> None:
+        message: _Message | None = None
         try:
             with self._bag:
                 while (message := self._next()) is not None:
@@ -216,7 +238,9 @@ class Recorder:
         except Exception as error:  # whatever it is, it ends only the recording
             with self._changed:
                 self._error = str(error) or type(error).__name__
-                self._dropped += 1 + len(self._queue)
+                kept = self._bag.n_whole
+                self._dropped += self._written - kept + (message not in (None, _SYNC)) + len(self._queue)
+                self._written = kept
                 self._queue.clear()
         self._ended(self.state())
 

@@ -76,6 +76,11 @@ class BagWriter:
         """Names of the topics declared so far."""
         return self._topics.keys()
 
+    @property
+    def n_whole(self) -> int:
+        """How many messages are in whole chunks: those that the file keeps where it can't be written any further."""
+        return self._writer.n_whole
+
     def add_topic(
         self,
         topic: str,

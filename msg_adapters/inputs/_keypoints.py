@@ -28,6 +28,8 @@ _LISTS = (6, 7, 8)  # CUBE_LIST, SPHERE_LIST, POINTS
 _PERSON = 100
 """How many marker ids each person has."""
 _LONGEST_NAME = 60
+_Key = tuple[str, int]
+"""Namespace and number of a person among markers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,21 +66,20 @@ def _of_poses(data: Buffer, n: int) -> dict[str, Keypoints]:
 
 
 def _of_markers(markers: Sequence[Marker], n: int) -> dict[str, Keypoints]:
-    people: dict[str, Keypoints] = {}
-    loose: dict[str, list[Marker]] = {}
+    people: dict[_Key, Keypoints] = {}
+    loose: dict[_Key, list[Marker]] = {}
     shown = [marker for marker in markers if marker.action == _ADD]
     lists = [marker for marker in shown if marker.type in _LISTS]
     several = len({marker.ns for marker in lists}) < len(lists)
     for marker in lists:
         _check_count(len(marker.points), n, "points")
         alpha = marker.colors[:, 3] if len(marker.colors) == n else np.full(n, 1.0)
-        name = _name(marker.ns, marker.id if several else 0)
         seen = _keypoints(marker.points, alpha, marker.stamp_ns, marker.frame_id)
-        people[name] = replace(seen, points=marker.placed(seen.points))
+        people[marker.ns, marker.id if several else 0] = replace(seen, points=marker.placed(seen.points))
     for marker in shown:
         if marker.type in (_CUBE, _SPHERE):
-            loose.setdefault(_name(marker.ns, marker.id // _PERSON), []).append(marker)
-    for name, found in loose.items():
+            loose.setdefault((marker.ns, marker.id // _PERSON), []).append(marker)
+    for key, found in loose.items():
         points, alpha = np.full((n, 3), np.nan), np.zeros(n)
         for marker in found:
             which = marker.id % _PERSON
@@ -86,11 +87,11 @@ def _of_markers(markers: Sequence[Marker], n: int) -> dict[str, Keypoints]:
                 msg = f"the marker {marker.ns}/{marker.id} is keypoint {which}, wanted 0 to {n - 1}; set keypoints"
                 raise DecodeError(msg)
             points[which], alpha[which] = marker.pose[:3], marker.color[3]
-        people.setdefault(name, _keypoints(points, alpha, found[0].stamp_ns, found[0].frame_id))
+        people.setdefault(key, _keypoints(points, alpha, found[0].stamp_ns, found[0].frame_id))
     if shown and not people:
         msg = f"{len(shown)} markers, none of them keypoints; wanted a SPHERE_LIST or POINTS a person, or spheres"
         raise DecodeError(msg)
-    return people
+    return _named(people)
 
 
 def _check_count(count: int, n: int, what: str) -> None:
@@ -103,6 +104,15 @@ def _keypoints(points: NDArray[np.float64], confidence: NDArray[np.floating], st
     seen = np.array(points, np.float64)
     seen[~seen.any(axis=1)] = np.nan
     return Keypoints(seen, np.asarray(confidence, np.float64), stamp, frame_id)
+
+
+def _named(people: dict[_Key, Keypoints]) -> dict[str, Keypoints]:
+    """Everybody by name: whoever has another's (as `1a` has that of `person_1a`) is told apart by a checksum."""
+    found: dict[str, Keypoints] = {}
+    for key in sorted(people, key=lambda key: (_name(*key) != key[0], key)):  # who is called so keeps the name
+        name = _name(*key)
+        found[f"{name}_{zlib.crc32(repr(key).encode()):08x}" if name in found else name] = people[key]
+    return found
 
 
 def _name(namespace: str, number: int) -> str:

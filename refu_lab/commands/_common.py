@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from refu_core import RefuError
+from refu_core._files import expanded
 from refu_core.errors import printable
 from refu_core.modes import BetasSource
 from refu_core.options import Spec, setting, specs_of
@@ -56,7 +57,7 @@ def add_subcommands(parser: argparse.ArgumentParser, *, metavar: str) -> Any:
 
 def names(text: str) -> tuple[str, ...]:
     """Parses `A,B`: at least one name; spaces are only in paths of garments."""
-    found = tuple(name.strip() for name in text.split(",") if name.strip())
+    found = tuple(expanded(name.strip()) for name in text.split(",") if name.strip())
     if not found or any(len(name.split()) > 1 and not name.endswith(".npz") for name in found):
         raise argparse.ArgumentTypeError(f"wanted names with commas between them, got {printable(repr(text))}")
     return found
@@ -109,7 +110,12 @@ def in_path(text: str) -> Path:
         text = ""
     if not text or "\0" in text:
         raise argparse.ArgumentTypeError("wanted a path, got nothing, or a name that no file has")
-    return Path(text)
+    return Path(expanded(text))
+
+
+def name_or_path(text: str) -> str:
+    """The name of something that ships, or the path of a file."""
+    return expanded(word(text))
 
 
 def _output(wanted: str, *kinds: Callable[[int], bool]) -> Callable[[str], Path]:
@@ -224,7 +230,7 @@ worn_by = partial(
     None,
     "body to dress: an SMPL file (.npz, official .pkl), or a built-in body's name; garments and networks are "
     "transferred to it (default: the body the garments were made for)",
-    parse=word,
+    parse=name_or_path,
     metavar="FILE",
 )
 off_collider = partial(

@@ -13,7 +13,10 @@ def add(commands: Any) -> None:
         "info", help="what is installed, built in and usable", description="What is installed."
     )
     parser.add_argument(
-        "--body", type=cli.word, metavar="FILE", help="say what a body model (.npz or official .pkl) holds instead"
+        "--body",
+        type=cli.name_or_path,
+        metavar="FILE",
+        help="say what a body model (.npz or official .pkl) holds instead",
     )
     cli.add_common(parser, run)
 

@@ -355,6 +355,19 @@ def test_one_file_that_cannot_be_read_costs_nothing_else(tmp_path: Path, last: s
         BagReader(tmp_path / "bag")
 
 
+def test_files_that_the_metadata_does_not_list_are_named_once(tmp_path: Path) -> None:
+    """Half of a split bag wasn't read, and nothing said so."""
+    bag = write_bag(tmp_path / "bag").parent
+    assert BagReader(bag).warnings == []
+    for name in ("bag_1.mcap", "bag_2.db3", "notes.txt"):
+        (bag / name).write_bytes(b"")
+    reader = BagReader(bag)
+    for _ in range(2):
+        assert len([*reader.messages()]) == 40
+        assert reader.warnings == [f"{bag}: metadata.yaml doesn't list bag_1.mcap and 1 more: not read"]
+    assert not reader.truncated
+
+
 def test_a_message_received_at_an_impossible_time(tmp_path: Path) -> None:
     data = encoder_for("multiarray")(frame(0))
     path = tmp_path / "late.mcap"

@@ -189,3 +189,19 @@ def test_streams_and_bags(tmp_path: Path) -> None:
     records = list(open_smpl_bag(tmp_path / "a.mcap", input_type="keypoint_poses"))
     assert [record.stamp_ns for record in records] == [10**9, 1_033_000_000, 1_066_000_000]
     assert all(record.frame is None and record.error is None for record in records)
+
+
+def test_no_two_people_of_a_message_have_one_name() -> None:
+    """Of `1a` and `person_1a` only one was dressed."""
+    spaces = ["1a", "person_1a", "1", "person_1"]
+    places = np.ones((len(spaces), K, 3)) * np.arange(1, 5)[:, None, None]
+    lists = [marker(7, ns=ns, points=spots) for ns, spots in zip(spaces, places, strict=True)]
+    sphere = marker(2, number=100, at=(9, 9, 9))  # the driver of Azure Kinect would call this person_1, too
+    named = [
+        {name: seen.points[0, 0] for name, seen in decode_keypoints("keypoint_markers", sent, K).items()}
+        for sent in (marker_array(*lists, sphere), marker_array(sphere, *lists[::-1]))
+    ]
+    assert named[0] == named[1], "whose marker comes first changes no name"
+    assert sorted(named[0].values()) == [1, 2, 3, 4, 9]
+    assert (named[0]["person_1a"], named[0]["person_1"]) == (2, 4), "who is called so keeps the name"
+    assert decode_keypoints("keypoint_markers", marker_array(lists[0]), K).keys() == {"person_1a"}

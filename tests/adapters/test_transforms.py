@@ -254,6 +254,27 @@ def test_where_things_were_is_forgotten_when_the_clock_is_set_back() -> None:
     assert matrix(buffer.lookup("map", "cam", 5 * S)) == pytest.approx(matrix(transform("map", "cam", 0, 2)))
 
 
+def test_transforms_tell_of_a_time_that_was_set_back_before_the_clock_does() -> None:
+    """Between /tf and /clock a person was placed half by transforms of the time before."""
+    steady = 0.0
+    buffer = TransformBuffer(clock=lambda: steady)
+    for tenths in range(80):
+        put(buffer, transform("map", "odom", tenths * S // 10, 1), transform("odom", "cam", tenths * S // 10, 1))
+    put(buffer, transform("robot", "hand", 8 * S), transform("hand", "lens"))
+    steady = 1.0
+    put(buffer, transform("odom", "cam", 5 * S, 2))
+    for ask in (lambda: buffer.lookup("map", "cam", 5 * S), lambda: buffer.known_until("map", "cam")):
+        with pytest.raises(TransformError, match="time was set back, and no transform of odom has come since"):
+            ask()
+    buffer.lookup("robot", "hand", 8 * S)  # whose way is another one loses nothing
+    steady = 1.1
+    put(buffer, transform("map", "odom", 5 * S, 3))
+    wanted = matrix(transform("map", "odom", 0, 3)) @ matrix(transform("odom", "cam", 0, 2))
+    np.testing.assert_allclose(matrix(buffer.lookup("map", "cam", 5 * S)), wanted, atol=1e-12)
+    put(buffer, transform("odom", "cam", 4 * S + 900 * MS, 2))  # a message that overtook another is no such thing
+    buffer.lookup("map", "cam", 5 * S, tolerance_ns=S)
+
+
 def test_frames_of_people_who_have_left_are_forgotten() -> None:
     now = 0.0
     buffer = TransformBuffer(clock=lambda: now)

@@ -274,6 +274,25 @@ def test_humans_are_found_when_they_are_wanted(stage: Callable[..., Stage]) -> N
     ann.close()
 
 
+def test_people_of_whom_others_tell_are_missed(stage: Callable[..., Stage], monkeypatch: pytest.MonkeyPatch) -> None:
+    """REP-155: whoever sent a body died, and the diagnostics said "0.0 Hz", level OK, for ever."""
+    monkeypatch.setattr("refu_ros._diagnostics._FIRST_INPUT_S", 0.5)
+    scene = stage(follow_humans=True, person_timeout=0.3)
+    ann = Peer("ann", topic="/humans/bodies/{}/joint_states")
+    scene.peer.watch()
+
+    def came() -> bool:
+        ann.send(frame(1), "ann")
+        return scene.peer.status("input")[0] == 0 and scene.peer.shown() == {f"ann/{GARMENTS[0]}"}
+
+    scene.until(came, "ann is dressed, and nobody is missed")
+    scene.until(lambda: scene.peer.status("input")[:2] == (1, "no input from ann"), "ann has a topic, and is silent")
+    ann.fall_silent("ann")
+    scene.until(lambda: scene.peer.status("input")[1].startswith("no input for"), "who sent her has gone")
+    assert scene.peer.status("input")[0] == 1
+    ann.close()
+
+
 def test_overridden_qualities_hold_each_time(stage: Callable[..., Stage]) -> None:
     scene = stage(**{"qos_overrides./smpl_params.subscription.reliability": "reliable"})
     there = partial(scene.peer.node.get_subscriptions_info_by_topic, "/smpl_params")

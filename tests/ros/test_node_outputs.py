@@ -568,6 +568,14 @@ def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callab
         return not people.listeners("ann")
 
     scene.until(nobody, "nobody is tracked")
+    scene.until(lambda: scene.peer.status("input")[:2] == (0, "0.0 Hz"), "an empty room is no fault")
+    sender.publish(message)
+
+    def misses_eve() -> bool:
+        says("eve")
+        return scene.peer.status("input")[:2] == (1, "no input from eve")
+
+    scene.until(misses_eve, "who is tracked, and never sends, is missed")
     people.node.destroy_publisher(tracked)  # its node has died: whoever comes now is known by a topic alone
     scene.until(lambda: people.listeners("ann"), "nobody says any more who is tracked", timeout=30.0)
     people.close()

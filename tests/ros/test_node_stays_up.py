@@ -16,12 +16,15 @@ from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
+from rclpy.event_handler import PublisherEventCallbacks  # noqa: E402
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 import refu_core  # noqa: E402
 from msg_adapters import BagReader  # noqa: E402
+from refu_ros._guard import GuardedNode  # noqa: E402
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,6 +73,22 @@ def test_it_is_brought_up_and_torn_down_while_viewers_come_and_go(scene: tuple[P
             assert change(peer, transition), (i, transition)
     for viewer in viewers:
         peer.node.destroy_subscription(viewer)
+
+
+def test_who_has_gone_is_not_waited_for(ros: None) -> None:  # noqa: ARG001
+    """With a MultiThreadedExecutor one thread takes a publisher down and another begins to wait: its spin ended."""
+    node = GuardedNode("guarded")
+    told = PublisherEventCallbacks(matched=lambda _: None)
+    publisher = node.create_publisher(MarkerArray, "garments", 1, event_callbacks=told)
+    waitable = next(one for one in publisher.event_handlers if one.event_type.name == "RCL_PUBLISHER_MATCHED")
+    with node.context.handle:
+        wait_set = _rclpy.WaitSet(0, 0, 0, 0, 0, 1, node.context.handle)
+    waitable.add_to_wait_set(wait_set)
+    node.destroy_publisher(publisher)
+    wait_set.clear_entities()
+    waitable.add_to_wait_set(wait_set)
+    assert not waitable.is_ready(wait_set)
+    node.destroy_node()
 
 
 def test_requests_that_are_not_valid_now_are_answered_in_the_negative(scene: tuple[Peer, NodeProcess]) -> None:

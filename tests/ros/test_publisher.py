@@ -124,6 +124,23 @@ def test_plays_a_bag(context: Context, tmp_path: Path, input_type: str, bag: str
         assert before < stamps[0] < stamps[-1] < time.time_ns()
 
 
+def test_a_motion_may_be_at_home(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(BAGS.parent))
+    node = SmplPublisher(context=context, cli_args=ros_arguments({"motion": "~/bags/walk"}))
+    assert len(node.motion) == len(load_motion(str(BAGS / "walk")))
+    node.destroy_node()
+
+
+@pytest.mark.parametrize("is_simulated", [False, True])
+def test_who_waits_for_a_clock_says_so(
+    context: Context, capfd: pytest.CaptureFixture[str], *, is_simulated: bool
+) -> None:
+    """Without a /clock it sent nothing for ever, and said nothing of it."""
+    given = ros_arguments({"use_sim_time": str(is_simulated).lower()})
+    SmplPublisher(context=context, cli_args=given).destroy_node()
+    assert ("as soon as /clock runs" in capfd.readouterr().err) == is_simulated
+
+
 def test_persons_stand_apart_and_move_apart(context: Context, tmp_path: Path) -> None:
     listener = Listener(context, "joint_state", ("ann/smpl_params", "bob/smpl_params"))
     log, decode = tmp_path / "log.txt", adapters.decoder_for("joint_state").from_bytes
