@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from refu_core._collector import collect_rarely, keep_what_is_loaded
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is imported; the programs say so themselves
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # of some hundred processes each would compile all modules again
 sys.dont_write_bytecode = False  # pytest, too, would rewrite all tests again in each of its processes
@@ -25,6 +27,8 @@ if "hypothesis" not in _MISSING:
         "refu", deadline=None, max_examples=40, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
     )
     settings.load_profile("refu")
+
+collect_rarely()
 
 if importlib.util.find_spec("torch"):  # the adapters' tests run without it
     import torch
@@ -98,11 +102,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """What has been imported stays: a collector that goes through it again and again took a tenth of the time."""
-    from refu_core._collector import collect_rarely, keep_what_is_loaded
-
     gc.collect()
     keep_what_is_loaded()
-    collect_rarely()
 
 
 class Unable(pytest.Module):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from refu_core._cache import remembered
 from refu_core._warp import Recorded, Repeated, as_warp, ints, is_plain, memory, torch_stream
 from refu_core.body import _aside_kernels as kernels
 from refu_core.body._collider_gradient import weights_at
@@ -18,7 +19,7 @@ from refu_core.body._collider_kernels import Means
 from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._model import SmplBody
 from refu_core.body._parts import ARMS, joints_of, part_of_faces
-from refu_core.body._segments import SOFTNESS, cut
+from refu_core.body._segments import SOFTNESS, Solids, cut
 from refu_core.mesh import Connectivity, linked
 
 Array = NDArray[np.float64]
@@ -63,30 +64,11 @@ class Aside:
         self._is_serial = device.type == "cpu"
         share = np.stack([weights[:, list(one)].sum(1) for one in ARMS], axis=1)
         solids = cut(mesh.faces, np.concatenate((1 - share.sum(1, keepdims=True), share), axis=1))
-        # What is averaged: the skin around each shoulder, the pieces of the arms, and where they were cut off.
-        rows = [np.clip(0.25 - np.abs(one - 0.5), 0.0, None) for one in share.T]
-        arm: list[int] = []
-        thumbs: list[float] = []
-        for i, (fore, upper) in enumerate(zip(_FOREARMS, _UPPER_ARMS, strict=True)):
-            shoulder, elbow, hand = joints[upper[0]], joints[fore[0]], joints[fore[-1]]
-            is_fore, is_upper = (weights[:, list(one)].sum(1) > 0.5 for one in (fore, upper))
-            is_upper &= (rest - (shoulder + elbow) / 2) @ (elbow - shoulder) > 0
-            is_hand = weights[:, list(fore[1:])].sum(1) > 0.5
-            pieces = _pieces(rest, mesh, is_fore, hand - elbow, _SLICES, is_hand)
-            pieces += _pieces(rest, mesh, is_upper, elbow - shoulder, _UPPER_SLICES, is_hand)
-            rows += [piece.vertices for piece in pieces]
-            thumbs += [piece.thumb for piece in pieces]
-            arm += [i] * len(pieces)
-        self._first_cap = len(rows)
-        for some in np.split(solids.middle_vertex, solids.middle_start[1:-1]):
-            rows.append(np.bincount(some, minlength=len(rest)).astype(np.float64))
-        row, vertex = np.nonzero(rows)
-        weight = np.stack(rows)[row, vertex]
-        self._start, self._vertex = self._tensor(np.searchsorted(row, np.arange(len(rows)))), self._tensor(vertex)
-        self._weight = self._tensor(weight / np.bincount(row, weight)[row])
-        self._arm = self._tensor(np.array(arm, np.int64))
-        self._thumb = self._tensor(np.array(thumbs, np.float32)[:, None])
-        """Radius of each middle's piece if it is of a thumb [m], else 0, shape (C, 1)."""
+        means = _means_of(rest, weights, joints, mesh, solids)
+        self._first_cap = means.first_cap
+        self._start, self._vertex = self._tensor(means.start), self._tensor(means.vertex)
+        self._weight, self._arm = self._tensor(means.weight), self._tensor(means.arm)
+        self._thumb = self._tensor(means.thumb)
         self._is_of = self._arm == torch.arange(len(ARMS), device=device)[:, None]
         """Which of the C middles belong to each arm, shape (2, C)."""
         self._share = self._tensor(share.T[:, :, None])
@@ -97,7 +79,7 @@ class Aside:
         """Faces of the body without its arms, closed, shape (F, 3)."""
         self._box = memory(2, 1, 3, device=device)
         self._corners = [as_warp(corner, wp.vec3) for corner in self._box]
-        self._points = memory(len(rest) + len(rows) - self._first_cap, 3, device=device)
+        self._points = memory(len(rest) + len(means.start) - self._first_cap, 3, device=device)
         at_rest = body.v_template.to(self._points)
         self._points.copy_(torch.cat((at_rest, self._means(at_rest)[self._first_cap :])))
         self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), ints(solids.faces[0].ravel(), device))
@@ -187,6 +169,55 @@ class Aside:
 
     def _tensor(self, values: NDArray[Any]) -> Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), device=self._device)
+
+
+class _Averaged(NamedTuple):
+    """The skin that is averaged: around each shoulder, in the pieces of the arms, and where they were cut off."""
+
+    start: NDArray[np.int64]
+    """Where the vertices of each row begin, shape (R,)."""
+    vertex: NDArray[np.int64]
+    """Shape (E,)."""
+    weight: Array
+    """How much each vertex counts; those of a row sum to one, shape (E,)."""
+    arm: NDArray[np.int64]
+    """Which arm each of the pieces is of, shape (C,)."""
+    thumb: NDArray[np.float32]
+    """Radius of a piece of a thumb [m], else 0, shape (C, 1)."""
+    first_cap: int
+    """The first row of those where an arm was cut off."""
+
+
+@remembered(4)  # every pipeline of a body asks for the same
+def _means_of(rest: Array, weights: Array, joints: Array, mesh: Connectivity, solids: Solids) -> _Averaged:
+    """Of a body's skin (V, 3) [m], skinning weights (V, 24) and joints (24, 3) [m], cut into `solids`."""
+    share = np.stack([weights[:, list(one)].sum(1) for one in ARMS])
+    rows = [np.clip(0.25 - np.abs(one - 0.5), 0.0, None) for one in share]
+    arm: list[int] = []
+    thumbs: list[float] = []
+    for i, (fore, upper) in enumerate(zip(_FOREARMS, _UPPER_ARMS, strict=True)):
+        shoulder, elbow, hand = joints[upper[0]], joints[fore[0]], joints[fore[-1]]
+        is_fore, is_upper = (weights[:, list(one)].sum(1) > 0.5 for one in (fore, upper))
+        is_upper &= (rest - (shoulder + elbow) / 2) @ (elbow - shoulder) > 0
+        is_hand = weights[:, list(fore[1:])].sum(1) > 0.5
+        pieces = _pieces(rest, mesh, is_fore, hand - elbow, _SLICES, is_hand)
+        pieces += _pieces(rest, mesh, is_upper, elbow - shoulder, _UPPER_SLICES, is_hand)
+        rows += [piece.vertices for piece in pieces]
+        thumbs += [piece.thumb for piece in pieces]
+        arm += [i] * len(pieces)
+    first_cap = len(rows)
+    for some in np.split(solids.middle_vertex, solids.middle_start[1:-1]):
+        rows.append(np.bincount(some, minlength=len(rest)).astype(np.float64))
+    row, vertex = np.nonzero(rows)
+    weight = np.stack(rows)[row, vertex]
+    return _Averaged(
+        np.searchsorted(row, np.arange(len(rows))),
+        vertex,
+        weight / np.bincount(row, weight)[row],
+        np.array(arm, np.int64),
+        np.array(thumbs, np.float32)[:, None],
+        first_cap,
+    )
 
 
 class _Piece(NamedTuple):

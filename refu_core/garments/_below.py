@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
+from refu_core._cache import remembered
 from refu_core._warp import Repeated, is_plain, strips
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, weight_of_parts
 from refu_core.garments._below_kernels import N_BELOW, Vertices, Weights, follow_kernel
@@ -42,20 +44,8 @@ class SkinBelow:
         """From both in their rest poses; on the body's device and in its precision."""
         skin, cloth = (one.v_template.detach().cpu().double().numpy() for one in (body, garment))
         part_of = weight_of_parts(body.weights.cpu(), _PARTS).argmax(1).numpy()
-        square, vertex = [], []
-        for part in range(len(_PARTS)):
-            (own,) = np.nonzero(part_of == part)
-            distance, nearest = cKDTree(skin[own]).query(cloth, N_BELOW)
-            square.append(torch.from_numpy(distance**2))
-            vertex.append(torch.from_numpy(own[nearest]))
-        # A part counts by its squared distance relative to that of the nearest part.
-        nearest_of = torch.stack([one[:, 0] for one in square], 1)
-        height = nearest_of.amin(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
-        by_part = (-2 * nearest_of / height).log_softmax(1)
-        within = [((one[:, :1] - one) / (2 * _WIDTH**2)).log_softmax(1) for one in square]
-        score = torch.cat([one + by_part[:, k, None] for k, one in enumerate(within)], 1)
-        best, which = score.topk(N_BELOW, 1)
-        return cls(torch.cat(vertex, 1).gather(1, which).int().to(body.device), best.softmax(1).to(body.v_template))
+        vertex, weight = _nearest(skin, cloth, part_of)
+        return cls(torch.from_numpy(vertex).to(body.device), torch.from_numpy(weight).to(body.v_template))
 
     def mean(self, values: Tensor) -> Tensor:
         """The mean below each vertex of the cloth, shape (N,), of `values` of the skin's vertices (V,)."""
@@ -71,6 +61,27 @@ class SkinBelow:
         by_vertex = shift.transpose(0, 1).flatten(1)
         moved = functional.embedding_bag(self.vertex, by_vertex, mode="sum", per_sample_weights=self.weight)
         return moved.view(len(self.vertex), len(shift), 3).transpose(0, 1)
+
+
+@remembered(8)  # every pipeline of a garment asks for the same
+def _nearest(
+    skin: NDArray[np.float64], cloth: NDArray[np.float64], part_of: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """`vertex` and `weight` of a `SkinBelow`: of cloth (N, 3) over skin (V, 3) [m], each vertex of a part (V,)."""
+    square, vertex = [], []
+    for part in range(len(_PARTS)):
+        (own,) = np.nonzero(part_of == part)
+        distance, nearest = cKDTree(skin[own]).query(cloth, N_BELOW)
+        square.append(torch.from_numpy(distance**2))
+        vertex.append(torch.from_numpy(own[nearest]))
+    # A part counts by its squared distance relative to that of the nearest part.
+    nearest_of = torch.stack([one[:, 0] for one in square], 1)
+    height = nearest_of.amin(1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+    by_part = (-2 * nearest_of / height).log_softmax(1)
+    within = [((one[:, :1] - one) / (2 * _WIDTH**2)).log_softmax(1) for one in square]
+    score = torch.cat([one + by_part[:, k, None] for k, one in enumerate(within)], 1)
+    best, which = score.topk(N_BELOW, 1)
+    return torch.cat(vertex, 1).gather(1, which).int().numpy(), best.softmax(1).numpy()
 
 
 _follow = Repeated(follow_kernel, (Vertices, Weights, wp.vec3, wp.int32, wp.vec3))

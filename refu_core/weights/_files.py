@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import struct
 from collections.abc import Collection, Mapping
@@ -146,10 +147,13 @@ def _load_stored(stem: Path, *, expect: Mapping[str, Any] | None = None) -> Weig
 
 
 def _require_sense(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    bad = [name for name, t in tensors.items() if t.is_floating_point() and not bool(torch.isfinite(t).all())]
+    # One pass and no copy; NaN is the least and the largest of whatever has one.
+    ends = {k: t.detach().aminmax() for k, t in tensors.items() if t.is_floating_point() and t.numel()}
+    most = {name: max(-float(low), float(high)) for name, (low, high) in ends.items()}
+    bad = [name for name, size in most.items() if not math.isfinite(size)]
     if bad:
         raise WeightsError(f"{path}: wanted finite weights, got NaN or infinity in {', '.join(bad)}")
-    large = [name for name, t in tensors.items() if t.is_floating_point() and t.numel() and t.abs().max() > LARGEST]
+    large = [name for name, size in most.items() if size > LARGEST]
     if large:
         msg = f"{path}: wanted weights of at most {LARGEST:g}, got larger ones in {', '.join(large)}; train it again"
         raise WeightsError(msg)
