@@ -159,8 +159,8 @@ class SequenceSettings(SimulationSettings):
     """Most simulated frames for which the body waits until cloth that is in it or in itself is out again. Of 90 frames
     of a T-shirt with a hand at its hem, 4 could be taken with none, 72 of 88 with these."""
     most_smoothing: float = 0.02
-    """A frame whose cloth would have to be smoothed by more than this isn't taken [m]; the sequence goes on. Smoothing by
-    30 to 140 mm was seen where sleeves drew together."""
+    """A frame whose cloth would have to be smoothed by more than this isn't taken [m]; the sequence goes on. Where
+    sleeves drew together, it was 30 to 140 mm."""
 
 
 class SequenceSimulator(Simulator):
