@@ -222,7 +222,7 @@ class BagJob:
             with contextlib.suppress(OSError, ValueError):
                 result: dict[str, Any] = json.loads(self._result.read_bytes())
                 return result
-        if code in (130, -signal.SIGTERM):
+        if code in (128 + signal.SIGINT, -signal.SIGTERM):
             said = NOT_BEGUN
         raise RefuError((said or f"it ended with {code}").removeprefix("refu: ").removeprefix("error: "))
 
