@@ -76,8 +76,8 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._on_parameters)
         for beat in (self._look_after, self._report):  # what fails in one must not keep the other from its work
             self.create_timer(_BEAT_S, self.guarded("each second", beat), clock=steady)
-        self._rest = self.create_timer(0.0, self.guarded("topics", self._hold_topics), clock=steady)
-        self._rest.cancel()
+        self._hold_later = self.create_timer(0.0, self.guarded("topics", self._hold_topics), clock=steady)
+        self._hold_later.cancel()
         if self._listener.is_steady:
             predict = self.guarded("predict", self._listener.predict)
             self.create_timer(1 / self.settings.keypoint_rate, predict, clock=steady)
@@ -205,13 +205,13 @@ class GarmentNode(GuardedNode, LifecycleNode):  # type: ignore[misc]
 
     def _hold_topics(self) -> None:
         """Keeps the publishers for everybody who may come, in what they wear."""
-        self._rest.cancel()
+        self._hold_later.cancel()
         if self._worker is None:  # it was deactivated meanwhile
             return
         persons, fittings = self._listener.persons, self._worker.fittings
         wanted = {topic: one.message_type for one in self._outputs for topic in one.topics(persons, fittings)}
         if not self._bank.hold(wanted, until=time.monotonic() + TURN_S):
-            self._rest.reset()
+            self._hold_later.reset()
 
     def device_lost(self, reason: str) -> None:
         """Goes on on the CPU, or ends, as `on_device_loss` says."""
