@@ -31,22 +31,26 @@ def train(options: TrainOptions, *, progress: bool) -> dict[str, Any]:
     Raises `RefuError` for invalid options, for a folder that another run writes to, and whenever training does.
     """
     _check(options)
-    dataset = GarmentDataset(options.data) if options.network == "sdf" else open_dataset(options.data)
+    opening = GarmentDataset if options.network == "sdf" else open_dataset
+    datasets = [opening(path) for path in options.data]
     folder = options.folder
     folder.mkdir(parents=True, exist_ok=True)
     if os.environ.get("RANK", "0") != "0":  # under torchrun, whose first process holds the lock
-        return _train(options, dataset, progress=progress)
+        return _train(options, datasets, progress=progress)
     busy = RefuError(f"{folder}: another training writes here; wait for it, or give another --output")
     with exclusive(folder / "lock", error=busy):
-        return _train(options, dataset, progress=progress)
+        return _train(options, datasets, progress=progress)
 
 
-def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *, progress: bool) -> dict[str, Any]:
+def _train(
+    options: TrainOptions, datasets: Sequence[GarmentDataset | GarmentSequences], *, progress: bool
+) -> dict[str, Any]:
     template = load_garment(options.garment)
     fit = load_fit(options.body or template.body)
     template, body = worn_on(template, fit), fit.body
     steps: dict[str, Any] = {} if options.steps is None else {"steps": options.steps}
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
+    dataset = datasets[0]
     if options.network == "sdf":
         assert isinstance(dataset, GarmentDataset)  # `train` has opened it as one
         to_sdf = replace(training.SdfSettings.of(options.preset), seed=options.seed, **steps)
@@ -57,7 +61,7 @@ def _train(options: TrainOptions, dataset: GarmentDataset | GarmentSequences, *,
     rehearsal = None if options.rehearse is None else training.Rehearsal(options.rehearse, motions)
     if options.network == "dynamics":
         moving = _seeded(training.DynamicsSettings(), options, **steps)
-        return training.train_dynamics(*given, mode=options.mode, settings=moving, **common)
+        return training.train_dynamics(template, datasets, options.folder, mode=options.mode, settings=moving, **common)
     if options.network in KINDS:
         assert rehearsal is not None  # `_check` has seen to it
         beyond = _seeded(training.BeyondSettings(), options, **steps)
@@ -94,6 +98,9 @@ def _check(options: TrainOptions) -> None:
     is_changed = changed != ("vertex", None, False, "garment", "realtime")
     presets = SDF_PRESETS if options.network == "sdf" else PRESETS
     refused = {
+        "several sets of --data are for --network dynamics: give one": (
+            len(options.data) > 1 and options.network != "dynamics"
+        ),
         "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out": (
             options.like is not None and not is_plain
         ),

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.backbones import Dynamics, DynamicsConfig, TailorNet, save_dynamics
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError
 from refu_core.frames import SmplFrame
-from refu_core.garments import GarmentTemplate
+from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.history import PoseHistory
 from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training import _data as data
@@ -54,7 +53,7 @@ class _Prepared(NamedTuple):
 
 def train_dynamics(
     garment: str | GarmentTemplate,
-    dataset: str | Path | GarmentDataset | GarmentSequences,
+    datasets: Sequence[str | Path | GarmentDataset | GarmentSequences],
     folder: str | Path,
     *,
     mode: str = "hybrid",
@@ -66,34 +65,39 @@ def train_dynamics(
     """Trains what moving cloth does beyond the garment's tailornet in `folder`, and writes `folder`/dynamics.
 
     All else, and what is returned, is as in `pretrain`; figures stand beside those of the tailornet alone. Raises
-    `RefuError` as that does, and for a set that isn't of sequences; `WeightsError` for no tailornet there, or a damaged
-    one.
+    `RefuError` as that does, and for no set or one of samples at rest; `WeightsError` for no tailornet there, or a
+    damaged one.
 
     Args:
-        dataset: simulated sequences (`refu simulate --sequences`).
+        datasets: sets of simulated sequences (`refu simulate --sequences`), of plans with different seeds.
         folder: holds tailornet-<mode> and its basis, which are left as they are.
         mode: mode of the tailornet; modes that share one share the dynamics, too.
     """
-    opened = data.TrainingSet.of(garment, dataset, body)
-    template, body, rows, folder = opened.garment, opened.body, opened.rows, Path(folder)
-    if not isinstance(rows, GarmentSequences):
-        raise RefuError(f"dynamics need sequences, got samples at rest: refu simulate {template.name} --sequences")
-    test = data.read_samples(rows, body, template, split="test")  # a missing test split is reported before any work
-    still, card_of_still = opened.tailornet(folder, mode)
+    template, folder = load_garment(garment) if isinstance(garment, str) else garment, Path(folder)
+    opened = [data.TrainingSet.of(template, dataset, body) for dataset in datasets]
+    sets = [one.rows for one in opened if isinstance(one.rows, GarmentSequences)]
+    if not sets or len(sets) < len(opened):
+        got = "samples at rest" if opened else "no set"
+        raise RefuError(f"dynamics need sequences, got {got}: refu simulate {template.name} --sequences makes them")
+    body = opened[0].body
+    # A missing test split is reported before any work.
+    test = _joined(data.read_samples(rows, body, template, split="test") for rows in sets)
+    samples = _joined(one.samples for one in opened)
+    still, card_of_still = opened[0].tailornet(folder, mode)
     settings = settings or DynamicsSettings()
     torch_device = start_parallel(device)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         dynamics = Dynamics(DynamicsConfig(still.config.joints), still)
     mirror = data.Mirror.of(template)
-    prepared = [_prepared(still, opened.samples, _pasts(rows, rows.train))]
+    prepared = [_prepared(still, samples, _pasts(sets, "train"))]
     if mirror is not None:
-        turned = data.mirrored(opened.samples, mirror)
-        prepared.append(_prepared(still, turned, _pasts(rows, rows.train, is_mirrored=True)))
-    train, validation = _split(opened.samples, prepared, settings)
+        turned = data.mirrored(samples, mirror)
+        prepared.append(_prepared(still, turned, _pasts(sets, "train", is_mirrored=True)))
+    train, validation = _split(samples, prepared, settings)
     dynamics.standardise(*train[:3], still.features.are_bounded(template))
     described = {
-        **opened.identity,
+        **opened[0].identity,
         "mode": mode,
         "tailornet_sha256": card_of_still["sha256"],
         "settings": asdict(settings),
@@ -111,19 +115,28 @@ def train_dynamics(
     objective = Objective([dynamics], predict, code_loss(still))
     loop.run(TrainingStage("dynamics", objective, settings.steps, train, validation))
     dynamics.to("cpu").eval()
-    figures = _figures(still, dynamics, test, _prepared(still, test, _pasts(rows, rows.test)), body, template)
-    card = {**described, "dataset": opened.card, "figures": figures}
+    figures = _figures(still, dynamics, test, _prepared(still, test, _pasts(sets, "test")), body, template)
+    card = {**described, "datasets": [one.card for one in opened], "figures": figures}
     if is_writer():
         save_dynamics(folder, dynamics, card)
         loop.checkpoint.unlink(missing_ok=True)
     return card
 
 
-def _pasts(dataset: GarmentSequences, rows: NDArray[np.bool_], *, is_mirrored: bool = False) -> Tensor:
-    """The past of every kept frame of some sequences, shape (N, 4, 219), in the order of `read_samples`."""
+def _joined(sets: Iterable[data.TrainingSamples]) -> data.TrainingSamples:
+    """The samples of all sets; each sequence keeps a number of its own."""
+    first, *others = sets
+    for other in others:
+        first = first.joined(replace(other, pair=other.pair + first.pair.max() + 1))
+    return first
+
+
+def _pasts(sets: Sequence[GarmentSequences], split: str, *, is_mirrored: bool = False) -> Tensor:
+    """The past of every kept frame of a split's sequences, shape (N, 4, 219), in the order of `read_samples`."""
     found = []
-    for row in np.flatnonzero(rows):
-        sequence = dataset.sequence(int(row))
+    for sequence in (rows.sequence(row) for rows in sets for row in range(len(rows))):
+        if sequence.split != split:
+            continue
         poses, transl = sequence.pose, sequence.transl.astype(np.float64)
         if is_mirrored:
             poses, transl = data.mirror_pose(torch.as_tensor(poses)).numpy(), transl * (-1, 1, 1)

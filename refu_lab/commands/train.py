@@ -20,7 +20,7 @@ TRAIN_MODES = ("none", "hybrid", "approx", "accurate", "collision-approx", "coll
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
     garment: str
-    data: Path
+    data: tuple[Path, ...]
     network: str = setting(
         "garment",
         "sdf: the paper's network for the body's distance (preset paper or small); dynamics: what moving cloth does "
@@ -99,7 +99,14 @@ def add(commands: Any) -> None:
         "continues when the same command is given again; torchrun shares it among GPUs.",
     )
     parser.add_argument("garment", metavar="GARMENT", help="a garment's name (refu garment list), or its .npz")
-    parser.add_argument("--data", type=cli.in_path, required=True, metavar="DIR", help="the garment's data set")
+    parser.add_argument(
+        "--data",
+        type=cli.in_path,
+        nargs="+",
+        required=True,
+        metavar="DIR",
+        help="the garment's data set; for dynamics, one or more",
+    )
     cli.add_options(parser, TrainOptions)
     cli.add_common(parser, run)
 

@@ -445,7 +445,7 @@ def test_it_learns_what_a_pose_cannot_tell(tmp_path: Path) -> None:
     samples = read_samples(open_dataset(data), load_body("male"), load_garment(GARMENT), split="train")
     weights = write(tmp_path / GARMENT, untrained(output_basis(samples.displacement, rank=8)))
     settings = DynamicsSettings(LoopSettings(weight_decay=0.01, learning_rate=3e-3), steps=300)
-    card = train_dynamics(GARMENT, data, weights, settings=settings, quiet=True)
+    card = train_dynamics(GARMENT, [data], weights, settings=settings, quiet=True)
     figures = card["figures"]
     assert figures["mpve_mm"] < 0.35 * figures["still_mm"]
     assert figures["basis_mm"] < figures["mpve_mm"]
@@ -454,13 +454,28 @@ def test_it_learns_what_a_pose_cannot_tell(tmp_path: Path) -> None:
     assert not (weights / "dynamics.checkpoint").exists()
 
 
+def test_sets_are_learnt_from_together(tmp_path: Path) -> None:
+    sets = [write_sequences(tmp_path / str(count), count=count, n_test=1, seconds=0.5) for count in (3, 4)]
+    samples = read_samples(open_dataset(sets[0]), load_body("male"), load_garment(GARMENT), split="train")
+    weights = write(tmp_path / GARMENT, untrained(output_basis(samples.displacement, rank=8)))
+    settings = DynamicsSettings(steps=1)
+    one, other, both = (
+        train_dynamics(GARMENT, some, weights, settings=settings, quiet=True) for some in (sets[:1], sets[1:], sets)
+    )
+    # Of two or three sequences none is kept for validation, of five one is.
+    assert both["figures"]["samples"] == one["figures"]["samples"] + other["figures"]["samples"]
+    n_frames = len(samples) // 2
+    assert [one["samples"], other["samples"]] == [2 * 2 * n_frames, 2 * 3 * n_frames]
+    assert both["samples"] == 2 * 4 * n_frames
+
+
 def test_samples_at_rest_teach_no_motion(tmp_path: Path) -> None:
     data = write_set(tmp_path / "rest", load_garment(GARMENT), load_body("male"))
     with pytest.raises(RefuError, match="--sequences"):
-        train_dynamics(GARMENT, data, tmp_path, quiet=True)
+        train_dynamics(GARMENT, [data], tmp_path, quiet=True)
 
 
 def test_a_tailornet_is_wanted_first(tmp_path: Path) -> None:
     data = write_sequences(tmp_path / "sequences", count=3, n_test=1, seconds=0.5)
     with pytest.raises(WeightsError, match="no such weights"):
-        train_dynamics(GARMENT, data, tmp_path / GARMENT, quiet=True)
+        train_dynamics(GARMENT, [data], tmp_path / GARMENT, quiet=True)
