@@ -45,7 +45,8 @@ def simulate(options: SimulateOptions, *, engine: Engine | None = None, progress
         how: dict[str, Any] = {"motions": clips, "body": options.body, "seed": options.seed, "progress": show}
         how["engine"] = engine
         if options.sequences:
-            return simulate_sequences(*what, shapes=options.shapes, seconds=options.seconds, **how)
+            how |= {"shapes": options.shapes, "seconds": options.seconds, "synthetic_share": options.synthetic}
+            return simulate_sequences(*what, **how)
         recorded = SamplePlan.recorded_share * (1 - options.postures)
         card = simulate_dataset(*what, recorded_share=recorded, posture_share=options.postures, **how)
     if not card["counts"]["to_do"]:

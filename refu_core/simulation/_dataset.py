@@ -69,8 +69,8 @@ class GarmentSequence:
     """Number of its body shape."""
     split: str
     """`train` or `test`."""
-    clip: str
-    """Name of the motion."""
+    clip: str | None
+    """Name of the motion; None for a synthetic one."""
     start: float
     """Where in the motion it starts [s]."""
     mirrored: bool
@@ -92,7 +92,7 @@ class GarmentSequence:
 class _Finished:
     """The finished rows of a set, in the order of their slots, memory-mapped and read-only."""
 
-    def __init__(self, path: str | Path, kind: str, *, first_clip: int) -> None:
+    def __init__(self, path: str | Path, kind: str) -> None:
         self._path = Path(path)
         self.card: dict[str, Any] = store.read_card(self._path, kind)
         """What the set is: plan, settings, versions, and counts and yield once it is summarised."""
@@ -105,7 +105,7 @@ class _Finished:
         self.test: NDArray[np.bool_] = self.column("split") == TEST
         self.train: NDArray[np.bool_] = ~self.test
         """Which rows are for training, shape (M,); the others, `test`, are kept for the test."""
-        self._check("clip", first_clip, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])) - 1)
+        self._check("clip", -1, np.where(self.test, len(self._clips["test"]), len(self._clips["train"])) - 1)
         if self.card.get("quantum_m") != store.QUANTUM:
             msg = f"{path}: wanted positions in units of {store.QUANTUM} m, got {str(self.card.get('quantum_m'))[:80]}"
             raise SimulationError(msg)
@@ -172,7 +172,7 @@ class GarmentDataset(_Finished):
 
     def __init__(self, path: str | Path) -> None:
         """Opens the set in the directory `path`. Raises `SimulationError` when there is none, or a damaged one."""
-        super().__init__(path, store.FORMAT, first_clip=-1)
+        super().__init__(path, store.FORMAT)
         plan = self.card.get("plan")
         count = plan.get("count") if isinstance(plan, dict) else None
         if not isinstance(count, int) or not 0 <= count < 2**31:
@@ -206,7 +206,7 @@ class GarmentSequences(_Finished):
 
     def __init__(self, path: str | Path) -> None:
         """Opens the set in the directory `path`. Raises `SimulationError` when there is none, or a damaged one."""
-        super().__init__(path, store.SEQUENCES, first_clip=0)
+        super().__init__(path, store.SEQUENCES)
         self._check("cause", 0, len(store.CAUSES))
 
     def sequence(self, index: int) -> GarmentSequence:
@@ -221,7 +221,7 @@ class GarmentSequences(_Finished):
             number=int(row["slot"]),
             shape=int(row["shape"]),
             split=split,
-            clip=self._clips[split][int(row["clip"])],
+            clip=None if row["clip"] < 0 else self._clips[split][int(row["clip"])],
             start=float(row["start"]),
             mirrored=bool(row["mirrored"]),
             _units=row["vertices"],

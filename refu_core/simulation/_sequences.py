@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
 from refu_core._engine import Engine
 from refu_core.errors import SimulationError
@@ -21,74 +19,12 @@ from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import GRAVITY
+from refu_core.simulation._motions import STEPS, DrawnMotion, recorded_motion, synthetic_motion
 from refu_core.simulation._plan import TEST, TRAIN, names_of, truncated_normal
-from refu_core.simulation._poses import Clip, as_clips, mirrored, split_clips, without_heading
+from refu_core.simulation._poses import Clip, as_clips, split_clips
 from refu_core.simulation._produce import Progress, produce
-from refu_core.simulation._store import CAUSES, DONE, FPS, SEQUENCES
-from refu_core.simulation._worker import FARTHEST, SimulationSettings, Simulator
-
-STEPS = 2
-"""Simulated frames per frame of the sequence."""
-_SMOOTH = 2.0  # simulated frames: standard deviation of the low-pass on recorded translations, which jitter
-_MOST_ACCELERATION = 20.0  # [m/s²]: as in a jump; more is an error of the recording
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnMotion:
-    """A stretch of a clip as n simulated frames, `STEPS` per frame of the sequence."""
-
-    poses: NDArray[np.float32]
-    """Rotation vectors [rad], shape (n, 24, 3); the first one faces +z."""
-    transl: NDArray[np.float64]
-    """Translations [m], shape (n, 3); x and z start at 0."""
-    clip: int
-    """Number of the clip."""
-    start: float
-    """Where in the clip it starts [s]."""
-    mirrored: bool
-    """Whether left and right are exchanged."""
-
-    def acceleration(self) -> NDArray[np.float64]:
-        """Acceleration of the root, smoothed and limited [m/s²], shape (n, 3)."""
-        if len(self.transl) < 3:
-            return np.zeros_like(self.transl)
-        smooth = gaussian_filter1d(self.transl, _SMOOTH, axis=0, mode="nearest")
-        second = np.gradient(np.gradient(smooth, axis=0), axis=0) * (FPS * STEPS) ** 2
-        size = np.linalg.norm(second, axis=1, keepdims=True)
-        limited: NDArray[np.float64] = second * np.minimum(1, _MOST_ACCELERATION / np.maximum(size, 1e-9))
-        return limited
-
-
-def n_steps(n_frames: int) -> int:
-    """Simulated frames of a sequence of `n_frames`: its frames and those between them."""
-    return (n_frames - 1) * STEPS + 1
-
-
-def draw_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Generator) -> DrawnMotion:
-    """A stretch of `n_frames` at `FPS` of one of the clips, mirrored or not.
-
-    Raises `SimulationError` when no clip is that long.
-    """
-    rate, n = FPS * STEPS, n_steps(n_frames)
-    lengths = np.array([int((len(clip.poses) - 1) / clip.fps * rate + 1e-9) + 1 for clip in clips])
-    long = np.flatnonzero(lengths >= n)
-    if not len(long):
-        got = f"{lengths.max() / rate:.1f} s" if len(lengths) else "none"
-        wanted = f"motions of {n_frames / FPS:g} s at least in training and test"
-        raise SimulationError(f"wanted {wanted}, the longest has {got}: ask for less")
-    weights = np.sqrt(lengths[long])
-    which = int(rng.choice(long, p=weights / weights.sum()))
-    first = int(rng.integers(lengths[which] - n + 1))
-    mirror = bool(rng.random() < 0.5)
-    clip = clips[which].resampled(rate)
-    poses, transl = clip.poses[first : first + n], clip.transl[first : first + n]
-    if mirror:
-        poses, transl = mirrored(poses), transl * (-1, 1, 1)
-    root = Rotation.from_rotvec(poses[:, 0].astype(np.float64))
-    heading = Rotation.from_rotvec(without_heading(poses[0])[0].astype(np.float64)) * root[0].inv()
-    poses[:, 0] = (heading * root).as_rotvec()
-    transl -= transl[0] * (1, 0, 1)
-    return DrawnMotion(poses, heading.apply(transl), which, first / rate, mirror)
+from refu_core.simulation._store import CAUSES, DONE, FPS, GOT_THROUGH, SEQUENCES
+from refu_core.simulation._worker import SimulationSettings, Simulator, is_lost
 
 
 @dataclass(frozen=True)
@@ -110,13 +46,15 @@ class SequencePlan:
     """Share of each shape's sequences, rounded up but never all, whose motions are from clips kept for the test."""
     spread: float = 1.2
     """Standard deviation of β before it is cut off at ±2."""
+    synthetic_share: float = 0.0
+    """Share of the training sequences whose motions are synthetic."""
 
     def __post_init__(self) -> None:
         """Raises `SimulationError` for numbers that make no plan."""
         if self.count < 1 or self.shapes < 1 or not 0 < self.seconds <= 600 or self.n_frames < 2:
             raise SimulationError(f"wanted a sequence and a shape at least, two frames to 600 s, got {asdict(self)}")
-        if not (0 <= self.test_share < 1 and self.spread > 0):
-            raise SimulationError(f"the test's share must lie in [0, 1) and the spread above 0, got {asdict(self)}")
+        if not (0 <= self.test_share < 1 and 0 <= self.synthetic_share <= 1 and self.spread > 0):
+            raise SimulationError(f"shares must lie in [0, 1) and the spread above 0, got {asdict(self)}")
 
     @property
     def n_frames(self) -> int:
@@ -143,8 +81,10 @@ class SequencePlan:
 
     def motion(self, slot: int, clips: list[Clip], attempt: int = 0) -> DrawnMotion:
         """The motion that a sequence tries to show. Raises `SimulationError` when no clip is long enough."""
-        key = self._key(2, slot, *([attempt] if attempt else []))
-        return draw_motion(clips, self.n_frames, np.random.default_rng(key))
+        is_synthetic = np.random.default_rng(self._key(3, slot)).random() < self.synthetic_share
+        rng = np.random.default_rng(self._key(2, slot, *([attempt] if attempt else [])))
+        draw = synthetic_motion if is_synthetic and self.split_of(slot) == TRAIN else recorded_motion
+        return draw(clips, self.n_frames, rng)
 
 
 @dataclass(frozen=True)
@@ -224,8 +164,8 @@ class SequenceSimulator(Simulator):
                     self._draper.rebuild(bodies[k - 1])
                 careful = k % STEPS == 0  # where a frame is stored; elsewhere it would only take time
                 now = cloth.frame(bodies[k - 1], body, gravity=gravity[k], drag=s.drag, careful=careful)
-            if not np.abs(cloth.positions).max() <= FARTHEST:
-                break  # the cloth is lost, and with it the rest of the sequence
+            if is_lost(cloth.positions):
+                break  # and with it the rest of the sequence
             if k % STEPS == 0:
                 t = k // STEPS
                 found, stored = self._freed(body, gravity[k])
@@ -246,11 +186,11 @@ class SequenceSimulator(Simulator):
         for pause in range(s.pauses + 1):
             if pause:
                 cloth.frame(body, body, gravity=gravity, drag=s.drape.drag[0], careful=True)
-                if not np.abs(cloth.positions).max() <= FARTHEST:
+                if is_lost(cloth.positions):
                     return "unsettled", None
             level = self._draper.untangled(cloth.positions, body)
             found, stored = self._examine(level, body, stretch=cloth.stretch(level))
-            if found is None:
+            if found not in GOT_THROUGH:
                 if np.linalg.norm(level - cloth.positions, axis=1).max() > s.most_smoothing:
                     found, stored = self._examine(cloth.positions, body, stretch=cloth.stretch())
                 cloth.positions[:] = level

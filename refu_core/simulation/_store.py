@@ -27,7 +27,9 @@ FORMAT = "refu-garments-2"
 SEQUENCES = "refu-sequences-2"
 QUANTUM = 2.0**-14
 """Unit of stored positions [m]: 0.06 mm, so ±2 m fit and rounding moves a vertex by at most 0.03 mm per axis."""
-CAUSES = ("body_collision", "self_intersection", "stretch", "unsettled")
+GOT_THROUGH = ("body_collision", "self_intersection")
+"""Causes that time and smoothing may mend: cloth that got through the body or itself."""
+CAUSES = (*GOT_THROUGH, "stretch", "unsettled")
 """Why a sample isn't taken, in the order of the checks."""
 FPS = 30
 """Frames of a sequence [1/s]."""

@@ -58,8 +58,12 @@ class Selector:
         return "unsettled" if speed > self.settings.speed else None
 
 
-FARTHEST = 1.9
-"""Cloth farther away along an axis [m] counts as lost: `quantise` doesn't reach much farther."""
+_FARTHEST = 1.9  # [m] along an axis: `quantise` doesn't reach much farther
+
+
+def is_lost(vertices: F32) -> bool:
+    """Whether cloth (N, 3) [m] is somewhere not finite, or too far off to be stored."""
+    return not np.abs(vertices).max() <= _FARTHEST
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ class Simulator(ABC):
 
     def _examine(self, vertices: F32, body: F32, *, stretch: float, speed: float = 0.0) -> tuple[str | None, Any]:
         """Why cloth is rejected, if it is, and the cloth as stored: None where it isn't finite or is too far off."""
-        if not np.abs(vertices).max() <= FARTHEST:
+        if is_lost(vertices):
             return "unsettled", None
         stored = quantise(vertices)
         read = dequantise(stored)  # What is checked is what will be read, rounding included.

@@ -38,6 +38,12 @@ class SimulateOptions:
     sequences: bool = setting(False, "continuous motions at 30 Hz with dynamics, instead of poses at rest")
     shapes: int = setting(5, "body shapes of the sequences", parse=cli.positive, metavar="K")
     seconds: float = setting(10.0, "length of each sequence [s]", within=(0.1, 3600.0), metavar="T")
+    synthetic: float = setting(
+        0.0,
+        "share of the training sequences whose motions go from one drawn pose to the next",
+        parse=cli.between(0.0, 1.0),
+        metavar="SHARE",
+    )
 
 
 def add(commands: Any) -> None:
@@ -73,7 +79,10 @@ def run(args: argparse.Namespace) -> int:
 
     if args.sequences and args.postures:
         raise RefuError("--postures are for poses at rest: leave --sequences out")
-    cli.require_use(args, {"shapes": "sequences", "seconds": "sequences", "input_axes": "motions", "fps": "motions"})
+    cli.require_use(
+        args,
+        dict.fromkeys(("shapes", "seconds", "synthetic"), "sequences") | {"input_axes": "motions", "fps": "motions"},
+    )
     if find_spec("numba") is None:  # said before the work begins, which imports it
         raise ModuleNotFoundError(name="numba")
     with open_engine(args.jobs, args.scheduler) as engine:

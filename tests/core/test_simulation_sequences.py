@@ -35,8 +35,9 @@ from refu_core.simulation import (
     summarise,
 )
 from refu_core.simulation._drape import CANONICAL_POSE
+from refu_core.simulation._motions import STEPS, n_steps, recorded_motion, synthetic_motion
 from refu_core.simulation._plan import TEST
-from refu_core.simulation._sequences import STEPS, SequenceSettings, SequenceSimulator, draw_motion, n_steps
+from refu_core.simulation._sequences import SequenceSettings, SequenceSimulator
 from refu_core.simulation._store import FPS, SEQUENCES, TO_DO, Rows, dequantise
 from refu_core.simulation._worker import Selector
 from refu_core.training._data import TakenAlong, read_samples
@@ -286,7 +287,7 @@ def test_plan_keeps_whole_clips_apart_and_shapes_together(count: int, shapes: in
 def test_stretches_are_those_of_the_clip(clips: Path) -> None:
     train, _ = split_clips(load_clips(clips))
     for seed in range(6):
-        motion = draw_motion(train, FRAMES, np.random.default_rng(seed))
+        motion = recorded_motion(train, FRAMES, np.random.default_rng(seed))
         n = n_steps(FRAMES)
         assert motion.poses.shape == (n, 24, 3)
         first = round(motion.start * FPS * STEPS)
@@ -294,11 +295,45 @@ def test_stretches_are_those_of_the_clip(clips: Path) -> None:
         np.testing.assert_allclose(motion.poses[:, side, 0], train[0].poses[first : first + n, 1, 0], atol=1e-5)
 
 
+def test_a_synthetic_motion_is_smooth_and_none_is_like_another(clips: Path) -> None:
+    train, _ = split_clips(load_clips(clips))
+    first, again, other = (synthetic_motion(train, 90, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.poses, again.poses)
+    assert np.abs(first.poses - other.poses).max() > 0.1
+    for motion in (first, other):
+        n = n_steps(90)
+        assert motion.poses.shape == (n, 24, 3)
+        assert motion.clip == -1
+        np.testing.assert_allclose(motion.transl[0, [0, 2]], 0, atol=1e-9)
+        forward = Rotation.from_rotvec(motion.poses[0, 0]).apply((0, 0, 1))
+        assert forward[2] > abs(forward[0])
+        turns = [
+            Rotation.from_rotvec(joint[:-1]).inv() * Rotation.from_rotvec(joint[1:])
+            for joint in motion.poses.swapaxes(0, 1)
+        ]
+        rates = np.stack([turn.as_rotvec() for turn in turns], 1) * FPS * STEPS
+        assert 1 < np.abs(rates).max() < 30
+        # A corner would be a change of several rad/s within one frame.
+        assert np.linalg.norm(np.diff(rates, axis=0), axis=-1).max() < 3.5
+        assert np.linalg.norm(motion.acceleration(), axis=1).max() < 15
+
+
+def test_tests_and_half_of_what_is_learnt_are_recorded(clips: Path) -> None:
+    split = split_clips(load_clips(clips))
+    plan = SequencePlan(GARMENT, 60, shapes=5, seconds=SECONDS, synthetic_share=0.5)
+    found = [(plan.split_of(slot), plan.motion(slot, split[plan.split_of(slot)]).clip) for slot in range(60)]
+    assert all(clip >= 0 for which, clip in found if which == TEST)
+    assert 0.3 < np.mean([clip < 0 for which, clip in found if which != TEST]) < 0.7
+    wholly = SequencePlan(GARMENT, 60, shapes=5, seconds=SECONDS)
+    for slot in (0, 1, 59):
+        assert wholly.motion(slot, split[wholly.split_of(slot)]).clip >= 0
+
+
 def test_acceleration_is_that_of_the_way() -> None:
     t = np.arange(120) / (FPS * STEPS)
     way = np.stack((2.0 * t**2, 0 * t, 0 * t), 1)
     clip = Clip("fall", np.zeros((120, 24, 3), np.float32), way, FPS * STEPS)
-    motion = draw_motion([clip], 60, np.random.default_rng(1))
+    motion = recorded_motion([clip], 60, np.random.default_rng(1))
     inner = motion.acceleration()[10:-10]
     np.testing.assert_allclose(np.abs(inner[:, 0]), 4.0, rtol=1e-3)
     np.testing.assert_allclose(inner[:, 1:], 0, atol=1e-6)
