@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from refu_core._engine import Engine
 from refu_core.errors import SimulationError
-from refu_core.frames import N_BETAS
+from refu_core.frames import LAGS, N_BETAS
 from refu_core.garments import N_STYLES
 from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import GRAVITY
@@ -101,6 +101,14 @@ class SequenceSettings(SimulationSettings):
     most_smoothing: float = 0.02
     """A frame whose cloth would have to be smoothed by more than this isn't taken [m]; the sequence goes on. Where
     sleeves drew together, it was 30 to 140 mm."""
+    most_caught: int = 8
+    """After so many frames in a row with cloth in the body or in itself it is draped anew: a hand that has got under a
+    hem stays there. Of a sequence with a hand in the T-shirt 9 % of the frames could be taken, and 77 % with this, in a
+    quarter of the time."""
+
+
+_LOOKED_BACK = math.ceil(max(LAGS) * FPS)
+"""Frames that networks are told of."""
 
 
 class SequenceSimulator(Simulator):
@@ -147,7 +155,8 @@ class SequenceSimulator(Simulator):
 
         The cloth is simulated in a frame of reference that moves with the root and doesn't turn. There, the body's
         acceleration acts as gravity with the opposite sign, and the air is still. The cloth starts at rest in
-        `start` (N, 3) [m].
+        `start` (N, 3) [m]. Cloth that stays caught is draped anew, and its frames aren't taken until it moves as if it
+        had been there all along.
         """
         s, cloth, poses = self.settings, self._draper.cloth, motion.poses
         bodies = np.concatenate([self._draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
@@ -157,6 +166,7 @@ class SequenceSimulator(Simulator):
         vertices = np.zeros((n, *start.shape), np.int16)
         cause = np.full(n, 1 + CAUSES.index("unsettled"), np.uint8)
         stretch, speed = np.full((2, n), np.nan, np.float32)
+        caught, moves_from = 0, 0
         for k, body in enumerate(bodies):
             now = 0.0
             if k:
@@ -171,8 +181,14 @@ class SequenceSimulator(Simulator):
                 found, stored = self._freed(body, gravity[k])
                 if stored is None:
                     break
+                caught = caught + 1 if found in GOT_THROUGH else 0
+                found = "unsettled" if found is None and t < moves_from else found
                 vertices[t], cause[t] = stored, 0 if found is None else 1 + CAUSES.index(found)
                 stretch[t], speed[t] = cloth.stretch(), now  # a moving cloth may be fast: no limit on its speed
+                if caught == s.most_caught:
+                    drape = self._draper.drape(poses[k], betas, style)
+                    self._draper.begin(drape.vertices, betas, style, body)
+                    caught, moves_from = 0, t + 1 + _LOOKED_BACK
         return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
 
     def _freed(self, body: F32, gravity: F32) -> tuple[str | None, Any]:

@@ -80,8 +80,9 @@ def train_dynamics(
         got = "samples at rest" if opened else "no set"
         raise RefuError(f"dynamics need sequences, got {got}: refu simulate {template.name} --sequences makes them")
     body = opened[0].body
-    # A missing test split is reported before any work.
-    test = _joined(data.read_samples(rows, body, template, split="test") for rows in sets)
+    # Sets of synthetic motions may be for training alone. Where no set is for the test, that is said before any work.
+    tested = [rows for rows in sets if rows.test.any()] or sets
+    test = _joined(data.read_samples(rows, body, template, split="test") for rows in tested)
     samples = _joined(one.samples for one in opened)
     still, card_of_still = opened[0].tailornet(folder, mode)
     settings = settings or DynamicsSettings()

@@ -38,7 +38,7 @@ from refu_core.simulation._drape import CANONICAL_POSE
 from refu_core.simulation._motions import STEPS, n_steps, recorded_motion, synthetic_motion
 from refu_core.simulation._plan import TEST
 from refu_core.simulation._sequences import SequenceSettings, SequenceSimulator
-from refu_core.simulation._store import FPS, SEQUENCES, TO_DO, Rows, dequantise
+from refu_core.simulation._store import CAUSES, FPS, SEQUENCES, TO_DO, Rows, dequantise
 from refu_core.simulation._worker import Selector
 from refu_core.training._data import TakenAlong, read_samples
 from refu_lab.cli import main
@@ -195,6 +195,32 @@ def test_cloth_that_got_through_is_brought_back(clips: Path, is_in_body: bool) -
     # What was smoothed by so much that it would be seen isn't taken.
     assert (found is None) == (is_in_body or moved.max() <= simulator.settings.most_smoothing)
     assert simulator._selector.cause(dequantise(stored), body) == found
+
+
+def test_caught_cloth_is_draped_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in "ab":
+        write_clip(tmp_path / f"{name}.npz", 0.0, frames=70)
+    plan = SequencePlan(GARMENT, 2, shapes=1, seconds=1.0, synthetic_share=1.0)
+    simulator = SequenceSimulator(plan, split_clips(load_clips(tmp_path)), SequenceSettings(), None)
+    freed, most, bodies = simulator._freed, simulator.settings.most_caught, []
+
+    def caught_at_first(body: NDArray[np.float32], gravity: NDArray[np.float32]) -> tuple[str | None, Any]:
+        found, stored = freed(body, gravity)
+        bodies.append(body)
+        return ("body_collision" if len(bodies) <= most else found), stored
+
+    monkeypatch.setattr(simulator, "_freed", caught_at_first)
+    row = simulator.simulate(0)
+    cause = np.array(row["cause"])
+    settling = slice(most, most + 16)  # 8/15 s, as far as networks look back
+    assert (cause[:most] == 1 + CAUSES.index("body_collision")).all()
+    assert (cause[settling] != 0).all()
+    assert (cause[settling] == 1 + CAUSES.index("unsettled")).any()
+    assert (cause[settling.stop :] == 0).any()
+    # Caught cloth goes on from the drape of its body's pose.
+    drape = simulator._draper.drape(row["pose"][most - 1], row["betas"], row["style"])
+    after, before = (dequantise(row["vertices"][t]) for t in (most, most - 1))
+    assert np.abs(after - drape.vertices).mean() < np.abs(after - before).mean()
 
 
 def arrays(path: Path) -> dict[str, NDArray[Any]]:
