@@ -71,8 +71,7 @@ def open_pieces(v: F64, f: Ints, label: Ints) -> NDArray[np.bool_]:
     n = int(label.max()) + 1
     rims = np.bincount(label[a], np.linalg.norm(v[a] - v[b], axis=1), n)
     area = np.bincount(label[f[:, 0]], np.linalg.norm(face_normals(v, f), axis=1) / 2, n)
-    opened: NDArray[np.bool_] = rims > _PINHOLES * np.sqrt(area)
-    return opened
+    return rims > _PINHOLES * np.sqrt(area)
 
 
 def no_opening(f: Ints) -> str:

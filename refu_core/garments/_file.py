@@ -183,8 +183,7 @@ _LENGTHS = {"v_template", "shapedirs", "styledirs"}
 def _rounded(values: NDArray[Any], bits: int) -> NDArray[np.float64]:
     """Multiples of 2^-bits."""
     scale = float(1 << bits)
-    rounded: NDArray[np.float64] = np.rint(values.astype(np.float64) * scale) / scale
-    return rounded
+    return np.rint(values.astype(np.float64) * scale) / scale
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:

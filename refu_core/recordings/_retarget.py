@@ -63,8 +63,7 @@ class SourceSkeleton:
 
     def middle(self, name: str) -> Array:
         """The places between both sides of a point (T, 3)."""
-        middle: Array = (self.at(f"l_{name}") + self.at(f"r_{name}")) / 2
-        return middle
+        return (self.at(f"l_{name}") + self.at(f"r_{name}")) / 2
 
     def across(self, name: str) -> Array:
         """From the right side of a point to the left one (T, 3)."""
