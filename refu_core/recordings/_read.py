@@ -149,7 +149,7 @@ def _recording(
     transl = transl_of(one(layout.transl), layout, n, notes)
     scaling = one(table.SCALINGS)
     if scaling is not None:
-        if scaling.dtype.kind not in "iuf" or not scaling.size or not 1e-6 <= scaling.flat[0] <= 1e6:
+        if scaling.dtype.kind not in "iuf" or not scaling.size or not 1e-6 <= float(scaling.flat[0]) <= 1e6:
             raise ValueError(f"{table.SCALINGS[0]} must be a number in [1e-6, 1e6], got {scaling.reshape(-1)[:1]}")
         transl = transl / scaling.flat[0]
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
