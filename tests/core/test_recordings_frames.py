@@ -69,7 +69,9 @@ ODD_ROWS: dict[str, dict[str, Any]] = {
 def test_odd_rows_of_an_image_are_refused(form: str, tmp_path: Path) -> None:
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps({f"{i}.jpg": ODD_ROWS[form] for i in range(3)}))
-    with pytest.raises(MotionFileError, match="smpl_thetas must be" if "pose" in form else "people's numbers must be whole"):
+    with pytest.raises(
+        MotionFileError, match="smpl_thetas must be" if "pose" in form else "people's numbers must be whole"
+    ):
         read_motion(path, fps=30)
 
 
