@@ -191,14 +191,10 @@ def names_like(keys: Iterable[str | int]) -> Iterator[tuple[Layout, dict[str | i
                 key: _SPELLED.get(word.removeprefix(before), _SPELLED.get(word)) for word, key in by_spelling.items()
             }
             known |= {by_spelling[before + spelled(name)]: name for name in layout.pose}
-            yield (
-                layout,
-                {
-                    key: name
-                    for key, name in known.items()
-                    if name not in (None, key) and not _is_known(key, name, layout)
-                },
-            )
+            renamed = {
+                key: name for key, name in known.items() if name not in (None, key) and not _is_known(key, name, layout)
+            }
+            yield layout, renamed
 
 
 def _is_known(key: str | int, name: str, layout: Layout) -> bool:
