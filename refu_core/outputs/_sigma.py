@@ -79,7 +79,8 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     """
     length, where = np.asarray(errors, np.float64), np.asarray(poses, np.float64)
     n = len(length)
-    if length.shape != (n, garment.n_vertices) or where.shape != (n, N_JOINTS, 3) or not np.isfinite(length).all():
+    is_shaped = length.shape == (n, garment.n_vertices) and where.shape == (n, N_JOINTS, 3)
+    if not is_shaped or not (np.isfinite(length).all() and np.isfinite(where).all()):
         wanted = f"finite errors (N, {garment.n_vertices}) and poses (N, {N_JOINTS}, 3)"
         raise MeshError(f"wanted {wanted}, got {length.shape} and {where.shape}")
     if n < 10 * REGIONS:
