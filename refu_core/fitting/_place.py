@@ -74,8 +74,6 @@ compares differ by less: 30 times, and a tenth of that, took a third longer and 
 _NORMED = 1e-3
 """An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit. A
 middle this near to the origin, as a share of the extent, was made so, too: the origin says nothing of the body."""
-
-
 _UNDER_ARMS = 0.1
 """How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
 _HAT = 0.3

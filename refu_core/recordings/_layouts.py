@@ -15,7 +15,6 @@ from refu_core.recordings._rotations import BODY, WHOLE
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
 """Suffixes of files that hold motion."""
 
-
 ROOT_PLACES = ("root_translation", "root_trans", "root_transl")
 PELVIS_PLACES = ("root_trans_offset", "root_trans_world", "root_trans_cam")
 """Names of translations that are where the pelvis is, instead of how far the mesh is moved."""
