@@ -113,11 +113,10 @@ def read_file(path: str | os.PathLike[str], *, most: int, error: type[RefuError]
 
 def read_json(path: str | os.PathLike[str], *, error: type[RefuError], wanted: str) -> Any:
     """The content of a JSON file of finite numbers. Raises `error` as `open_file` does, and if it isn't such a file."""
+    content = read_file(path, most=MAX_JSON_BYTES, error=error, wanted=wanted)
     try:
-        return parse_json(read_file(path, most=MAX_JSON_BYTES, error=error, wanted=wanted))
+        return parse_json(content)
     except (ValueError, RecursionError) as cause:
-        if isinstance(cause, error):
-            raise
         raise error(f"{os.fspath(path)}: can't be read as JSON: {cause}; wanted {wanted}") from cause
 
 

@@ -33,7 +33,7 @@ MAX_TEXT_BYTES = 1 << 15
 """The names of a skeleton's joints take a quarter of this."""
 _MAX_AXES = 32
 _MAX_HEADER_BYTES = 1 << 14
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """The compression methods that numpy writes; others may allocate gigabytes themselves."""
 DAMAGE = (
     *(OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError, MemoryError, OverflowError),
@@ -75,7 +75,7 @@ def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wante
 
     Raises `error`: the file can't be read, holds anything else under one of the keys, or holds more than `MAX_BYTES`.
     """
-    with _archive(path, error, wanted) as archive:
+    with open_archive(path, error, wanted) as archive:
         names = {entry: entry.filename.removesuffix(".npy") for entry in archive.infolist()}
         entries = {name: entry for entry, name in names.items() if name in keys}
         if len(entries) < sum(name in keys for name in names.values()):
@@ -95,12 +95,13 @@ def read_npz(path: Path, *, keys: Collection[str], error: type[RefuError], wante
 
 def npz_names(path: Path, *, error: type[RefuError], wanted: str) -> list[str]:
     """The names of the arrays in an archive. Raises `error` as `read_npz` does."""
-    with _archive(path, error, wanted) as archive:
+    with open_archive(path, error, wanted) as archive:
         return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
 @contextmanager
-def _archive(path: Path, error: type[RefuError], wanted: str) -> Iterator[zipfile.ZipFile]:
+def open_archive(path: Path, error: type[RefuError], wanted: str) -> Iterator[zipfile.ZipFile]:
+    """An archive of arrays. Raises `error` if it can't be read, and for any damage that shows while it is open."""
     with open_file(path, most=_MAX_FILE_BYTES, error=error, wanted=wanted) as file:
         file.step = _MAX_READ
         try:
@@ -131,7 +132,7 @@ def check_npy(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any
 
 
 def _check_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, budget: ArrayBudget) -> None:
-    if entry.compress_type not in _METHODS:
+    if entry.compress_type not in METHODS:
         raise ValueError(f"{entry.filename} is compressed by the method {entry.compress_type}, only deflate is read")
     if entry.compress_size > entry.file_size + (entry.file_size >> 8) + 1024:
         raise ValueError(f"{entry.filename} takes {entry.compress_size} bytes packed, and {entry.file_size} unpacked")

@@ -5,7 +5,6 @@ Modules that load torch are imported only where needed, so that a mistyped setti
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, partial
@@ -81,8 +80,10 @@ def check(settings: Any) -> None:
         value = getattr(settings, name)
         if spec.choices and value not in (*spec.choices, None):
             raise SettingsError(f"{name}: wanted {' or '.join(spec.choices)}, got {value!r}")
-        low, high = spec.within or (-math.inf, math.inf)
-        for number in (value if isinstance(value, tuple) else (value,)) if spec.within else ():
+        if spec.within is None:
+            continue
+        low, high = spec.within
+        for number in value if isinstance(value, tuple) else (value,):
             if not low <= number <= high:  # NaN fails this, too
                 raise SettingsError(f"{name}: wanted {low:g} to {high:g}, got {number:g}")
 

@@ -45,9 +45,7 @@ def clean(mesh: SurfaceMesh) -> tuple[SurfaceMesh, list[str]]:
     mesh = _without_double_faces(_without_strays(mesh, notes), notes)
     mesh = _welded(mesh, notes)
     n_crowded = partners(mesh)[1]
-    mesh = _oriented(mesh, notes)
-    partner, _ = partners(mesh)
-    mesh = _cut_apart(mesh, partner)
+    mesh = _cut_apart(_oriented(mesh, notes))
     if n_crowded:
         notes.append(
             f"{n_crowded} edges had more than two faces and were cut open; simulated cloth would come apart there"
@@ -71,8 +69,7 @@ def open_pieces(v: F64, f: Ints, label: Ints) -> NDArray[np.bool_]:
     n = int(label.max()) + 1
     rims = np.bincount(label[a], np.linalg.norm(v[a] - v[b], axis=1), n)
     area = np.bincount(label[f[:, 0]], np.linalg.norm(face_normals(v, f), axis=1) / 2, n)
-    opened: NDArray[np.bool_] = rims > _PINHOLES * np.sqrt(area)
-    return opened
+    return rims > _PINHOLES * np.sqrt(area)
 
 
 def no_opening(f: Ints) -> str:
@@ -271,12 +268,12 @@ def turned_over(mesh: SurfaceMesh, flipped: NDArray[np.bool_]) -> SurfaceMesh:
     return replace(mesh, faces=turned(mesh.faces), uv=uv)
 
 
-def _cut_apart(mesh: SurfaceMesh, pairs: Ints) -> SurfaceMesh:
+def _cut_apart(mesh: SurfaceMesh) -> SurfaceMesh:
     """The mesh with a vertex for each fan of faces that edges hold together."""
     f = mesh.faces
     n = f.size
     following = np.arange(n).reshape(-1, 3)[:, [1, 2, 0]].ravel()
-    one, other = pairs.T
+    one, other = partners(mesh)[0].T
     # Faces are oriented alike, so an edge begins in one face where it ends in the other.
     links = np.concatenate((np.stack((one, following[other]), 1), np.stack((following[one], other), 1)))
     count, label = linked(links, n)

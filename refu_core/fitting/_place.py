@@ -74,8 +74,6 @@ compares differ by less: 30 times, and a tenth of that, took a third longer and 
 _NORMED = 1e-3
 """An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit. A
 middle this near to the origin, as a share of the extent, was made so, too: the origin says nothing of the body."""
-
-
 _UNDER_ARMS = 0.1
 """How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
 _HAT = 0.3
@@ -131,8 +129,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
             stands = not chosen.is_sideways or any(one.fit.is_good and not one.is_sideways for one in found)
             moved = [one for one in moved if not stands or one.faces_as(chosen)]
             first = [one for one in moved if MISFIT * one.cost(extent) < least] + first
-        for one in first:
-            yield search.told(one)
+        yield from map(search.told, first)
     rings = [one for one in found if one.fit.is_ring and not one.kind and not one.is_sideways]
     if rings and not good:  # a mesh around the body where it was modelled isn't searched elsewhere
         yield search.told(rings[0])
@@ -169,18 +166,15 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
         first = [one for one in order if search.knows(one) and one.faces_as(best)]
         order = [*first, best, *(one for one in order if one not in first)]
     order += [one for one in scaled if one.fit.is_good]  # if a limb goes through it everywhere else
-    for one in order:
-        yield search.told(one)
+    yield from map(search.told, order)
     scaled = [one for one in search.best_of(rough, scales=True) if one.fit.is_good]
-    for one in scaled:
-        yield search.told(one)
+    yield from map(search.told, scaled)
     order += scaled
     lying = [] if placing.up or placing.is_placed else search.along(bodies, LYING, units, scales=False)
     least = min((one.cost(extent) for one in (*good, *order)), default=math.inf)
     # Nobody wears a garment on a hand, or upside down, that can be worn upright.
     lying = [one for one in lying if one.fit.is_plain and MISFIT * one.cost(extent) < least]
-    for one in lying:
-        yield search.told(one)
+    yield from map(search.told, lying)
     if good or order or lying or any(one.fit.is_good for one in tiers):
         return
     if not tiers:

@@ -115,9 +115,9 @@ class Samples(NamedTuple):
     """Area of the surface that each point stands for, shape (P,)."""
 
 
-def sample(mesh: SurfaceMesh, count: int, seed: int = 0) -> Samples:
-    """`count` points drawn by area."""
-    rng = np.random.default_rng(seed)
+def sample(mesh: SurfaceMesh, count: int) -> Samples:
+    """`count` points drawn by area, the same ones each time."""
+    rng = np.random.default_rng(0)
     normals = face_normals(mesh.vertices, mesh.faces)
     area = np.linalg.norm(normals, axis=1)
     face = np.searchsorted(np.cumsum(area), (np.arange(count) + rng.random(count)) / count * area.sum())

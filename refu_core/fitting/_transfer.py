@@ -76,10 +76,11 @@ class Transfer:
         if is_trusted.mean() < _OF_ITS_OWN:  # ruffles all over, or a single strap: the nearest skin is all there is
             is_trusted = np.abs(distance) <= max(np.quantile(np.abs(distance), 0.5), 0.02)
         sizes = [np.linalg.norm(np.ptp(vertices[label == k], axis=0)) for k in range(n_pieces)]
-        is_small = np.array(sizes) < _RIGID
-        rigid = tuple(np.flatnonzero(label == k) for k in range(n_pieces) if is_small[k] and not is_small.all())
+        is_rigid = np.array(sizes) < _RIGID
+        is_rigid &= not is_rigid.all()
+        rigid = tuple(np.flatnonzero(label == k) for k in np.flatnonzero(is_rigid))
         trusted = np.bincount(label, is_trusted) / np.bincount(label)
-        is_led = (trusted < _OF_ITS_OWN) | (is_small & ~is_small.all())
+        is_led = (trusted < _OF_ITS_OWN) | is_rigid
         laplacian = _laplacian(vertices, faces, _seams(vertices, label, rim, is_led))
         body_faces = body.body.faces.numpy()
         return cls(face, barycentric, distance, is_trusted, body_faces, vertex_areas(vertices, faces), laplacian, rigid)

@@ -183,8 +183,7 @@ _LENGTHS = {"v_template", "shapedirs", "styledirs"}
 def _rounded(values: NDArray[Any], bits: int) -> NDArray[np.float64]:
     """Multiples of 2^-bits."""
     scale = float(1 << bits)
-    rounded: NDArray[np.float64] = np.rint(values.astype(np.float64) * scale) / scale
-    return rounded
+    return np.rint(values.astype(np.float64) * scale) / scale
 
 
 def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
@@ -201,8 +200,11 @@ def _check(data: dict[str, NDArray[Any]]) -> GarmentCard:
     n = len(data["v_template"]) if data["v_template"].ndim else 0
     shapes = {"weights": (n, N_JOINTS), "shapedirs": (n, 3, N_BETAS), "styledirs": (n, 3, N_STYLES)}
     for key, shape in {"v_template": (n, 3), **shapes}.items():
-        if key in data and (data[key].shape != shape or not n or not np.isfinite(data[key]).all()):
-            raise ValueError(f"{key}: wanted finite numbers of the shape {shape}, got {data[key].shape}")
+        array = data.get(key)
+        if array is None:
+            continue
+        if array.shape != shape or not n or array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+            raise ValueError(f"{key}: wanted finite numbers of the shape {shape}, got {array.dtype} {array.shape}")
     if not (data["weights"] >= 0).all() or np.abs(data["weights"].sum(1) - 1).max() > 1e-3:
         raise ValueError("weights: wanted shares of joints, rows that sum to 1")
     faces = check_faces(data["f"], n_vertices=n)

@@ -84,7 +84,7 @@ _COCO += "l_ankle r_ankle"
 _KINECT = "mid_hip kinect_navel kinect_chest kinect_neck l_kinect_clavicle l_shoulder l_elbow l_wrist l_hand l_handtip "
 _KINECT += "l_thumb r_kinect_clavicle r_shoulder r_elbow r_wrist r_hand r_handtip r_thumb l_hip l_knee l_ankle l_foot "
 _KINECT += "r_hip r_knee r_ankle r_foot kinect_head nose l_eye l_ear r_eye r_ear"
-_NAMES: dict[str, str] = {
+POINTS_OF: dict[str, str] = {
     "coco17": _COCO,
     "halpe26": _COCO + " head_top - mid_hip l_big_toe r_big_toe l_small_toe r_small_toe l_heel r_heel",
     "body25": "nose - r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist mid_hip r_hip r_knee r_ankle "
@@ -116,7 +116,7 @@ lines between hips, shoulders and nose. "?" is a point of which nobody says wher
 _HEADS_OFF = {"zed18": 0.15, "zed34": 0.15}
 """How far all points of a head may be off together [m]. ZED measures the skin that it sees: above the shoulders, faces
 are 12 cm farther back than SMPL's in ten recordings of its 34 keypoints, but within 5 cm with Kinect and MediaPipe."""
-LAYOUTS: tuple[str, ...] = tuple(_NAMES)
+LAYOUTS: tuple[str, ...] = tuple(POINTS_OF)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +158,9 @@ class KeypointLayout:
 @cache
 def keypoint_layout(name: str) -> KeypointLayout:
     """A layout of `LAYOUTS`. Raises `RefuError` for another name."""
-    if name not in _NAMES:
+    if name not in POINTS_OF:
         raise RefuError(f"no layout of keypoints {name!r}: wanted {', '.join(LAYOUTS)}")
-    return layout_of(name, tuple(_NAMES[name].split()))
+    return layout_of(name, tuple(POINTS_OF[name].split()))
 
 
 def layout_of(name: str, words: tuple[str, ...]) -> KeypointLayout:

@@ -103,8 +103,8 @@ class Observer:
             self._skin.copy_(dressed.skin[0])
             self._skin_mesh.refit()
         drapes, blends = dict(dressed.drapes), {}
+        self.matched = dict.fromkeys(self._cloths, 0)
         for name, cloth in self._cloths.items():
-            self.matched[name] = 0
             if seen is None and not cloth.estimate.is_informed:
                 continue
             weights = self._pipeline.garments[name].weights

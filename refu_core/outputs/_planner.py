@@ -51,9 +51,9 @@ def fitted_means(shapes: Points, mesh: Connectivity, kept: NDArray[np.intp], she
     both directions, in which places that are farther off count more. Ridge regression then finds the weights that best
     do this for all shapes, within each coarse vertex's own neighbourhood.
     """
-    take = _means(shapes[0], mesh, kept, sheet)
     if len(kept) == shapes.shape[1]:
-        return take
+        return csr_array(eye_array(len(kept)))
+    take = _means(shapes[0], mesh, kept, sheet)
     for _ in range(_ROUNDS):
         goals = np.stack([_drawn(take @ shape, sheet, shape, mesh.faces) for shape in shapes])
         _regress(take, shapes, goals)
@@ -63,8 +63,6 @@ def fitted_means(shapes: Points, mesh: Connectivity, kept: NDArray[np.intp], she
 def _means(rest: Points, mesh: Connectivity, kept: NDArray[np.intp], sheet: NDArray[np.int32]) -> csr_array:
     """Weights half-way between those of the kept vertices and the least-squares fit of the rest pose."""
     own = csr_array((np.ones(len(kept)), (np.arange(len(kept)), kept)), shape=(len(kept), len(rest)))
-    if len(kept) == len(rest):
-        return own
     place = _placed(Surface(rest[kept], sheet), rest)
     weighed = (place.T * vertex_areas(rest, mesh.faces)).toarray()
     normal = np.asarray(weighed @ place)
@@ -153,7 +151,6 @@ _POSES = {
     "left_shoulder 0.2 -0.2 -1.2, right_shoulder 0.2 0.4 1.1, right_elbow 0 1.2 0",
 }
 """Poses in which a planner's mesh has to fit, as `refu_core.skeleton.posed` reads them [rad]."""
-Worn = NDArray[np.float64]
 
 
 class PlannerMesh:
@@ -172,7 +169,7 @@ class PlannerMesh:
         max_triangles: int = MAX_TRIANGLES,
         *,
         half_thickness: float = HALF_THICKNESS,
-        worn: Callable[[], Worn] | None = None,
+        worn: Callable[[], Points] | None = None,
     ) -> None:
         """Prepares for a garment: some seconds the first time, after which the result is cached (`REFU_CACHE`).
 
@@ -237,7 +234,7 @@ class PlannerMesh:
 
 
 def _prepared(
-    garment: GarmentTemplate, rest: NDArray[np.float64], max_triangles: int, worn: Callable[[], Worn] | None
+    garment: GarmentTemplate, rest: NDArray[np.float64], max_triangles: int, worn: Callable[[], Points] | None
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], csr_array]:
     """The vertices that are kept, the sheet's faces and its weights; computed once for a garment, and then cached."""
     digest = hashlib.sha256(rest.astype(np.float32).tobytes() + garment.mesh.faces.tobytes()).hexdigest()[:16]

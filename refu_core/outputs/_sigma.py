@@ -19,6 +19,7 @@ from refu_core.body import SmplBody
 from refu_core.errors import FrameError, MeshError, WeightsError
 from refu_core.frames import N_JOINTS, SmplFrame
 from refu_core.garments import GarmentTemplate
+from refu_core.keypoints._pose import skew
 from refu_core.outputs._worn import require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.skeleton import CARRIED
@@ -78,7 +79,8 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     """
     length, where = np.asarray(errors, np.float64), np.asarray(poses, np.float64)
     n = len(length)
-    if length.shape != (n, garment.n_vertices) or where.shape != (n, N_JOINTS, 3) or not np.isfinite(length).all():
+    is_shaped = length.shape == (n, garment.n_vertices) and where.shape == (n, N_JOINTS, 3)
+    if not is_shaped or not (np.isfinite(length).all() and np.isfinite(where).all()):
         wanted = f"finite errors (N, {garment.n_vertices}) and poses (N, {N_JOINTS}, 3)"
         raise MeshError(f"wanted {wanted}, got {length.shape} and {where.shape}")
     if n < 10 * REGIONS:
@@ -249,9 +251,7 @@ def _input_variance(
 def _right_jacobians(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Right Jacobians J of rotation vectors (N, 3) [rad], shape (N, 3, 3): R(θ + dθ) = R(θ) exp([J dθ]×)."""
     angle = np.linalg.norm(pose, axis=1)[:, None, None]
-    x, y, z = pose.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    cross = skew(pose)
     square = np.maximum(angle, 1e-3) ** 2
     first = np.where(angle < 1e-3, 0.5, (1 - np.cos(angle)) / square)
     second = np.where(angle < 1e-3, 1 / 6, (angle - np.sin(angle)) / (square * np.maximum(angle, 1e-3)))

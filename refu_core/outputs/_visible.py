@@ -62,8 +62,7 @@ class PinholeCamera:
                 f"{self.width} x {self.height}, {self.focal}, {rotation.tolist()}, {translation.tolist()}"
             )
             raise MeshError(msg)
-        object.__setattr__(self, "rotation", rotation)
-        object.__setattr__(self, "translation", translation)
+        vars(self).update(rotation=rotation, translation=translation)
 
     @classmethod
     def looking_at(

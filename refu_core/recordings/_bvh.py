@@ -20,7 +20,7 @@ from refu_core.keypoints import Proportions
 from refu_core.recordings._followed import follow, metres_of
 from refu_core.recordings._layouts import WANTED
 from refu_core.recordings._recording import MAX_FRAMES, Recording, check_fps
-from refu_core.recordings._retarget import SourceSkeleton, retargeted
+from refu_core.recordings._retarget import SourceSkeleton, bearer_of, retargeted
 from refu_core.recordings._upright import Array, Axes
 
 _MAX_BYTES = 256 << 20
@@ -218,14 +218,8 @@ def _between(joints: list[_Joint], places: Array, points: dict[str, int]) -> int
     """The joint that both legs hang on, if it is near the hips, whatever its name is."""
     if any(name not in points for name in ("l_hip", "r_hip", "l_knee")):
         return None
-    above: list[list[int]] = []
-    for at in (points["l_hip"], points["r_hip"]):
-        chain = [at]
-        while joints[chain[-1]].parent >= 0:
-            chain.append(joints[chain[-1]].parent)
-        above.append(chain[1:])
-    both = next((i for i in above[0] if i in above[1]), None)
-    if both is None or both in points.values():
+    both = bearer_of([joint.parent for joint in joints], points["l_hip"], points["r_hip"])
+    if both < 0 or both in points.values():
         return None
     left, right, knee = (places[points[name]] for name in ("l_hip", "r_hip", "l_knee"))
     off, thigh = np.linalg.norm(places[both] - (left + right) / 2), np.linalg.norm(left - knee)

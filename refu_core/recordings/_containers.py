@@ -18,7 +18,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from refu_core._files import open_file
-from refu_core._npz import DAMAGE, ArrayBudget, check_npy, npz_names, read_npz, told
+from refu_core._npz import DAMAGE, METHODS, ArrayBudget, check_npy, npz_names, open_archive, read_npz, told
 from refu_core._pickle import PickledArrays
 from refu_core._pickle_machine import MAX_PICKLE_BYTES, STREAM_MAGIC, Record, Unpickler, bytes_of, read_stream
 from refu_core.errors import RefuError
@@ -243,22 +243,18 @@ def _arrays(path: Path, names: set[str], error: type[RefuError]) -> dict[str, ND
 def _columns(path: Path, names: Collection[str], error: type[RefuError]) -> dict[str, NDArray[Any]]:
     columns: dict[str, NDArray[Any]] = {}
     left = _MOST_COLUMNS
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for entry in archive.infolist():
-                name = entry.filename.removesuffix(".npy")
-                is_plain = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-                if name not in names or not is_plain or entry.file_size > left:
-                    continue
-                left -= entry.file_size
-                data = archive.read(entry)
-                if b"'|O'" in data[:128]:
-                    continue
-                shape, dtype = check_npy(io.BytesIO(data), len(data))
-                if shape and max(shape) == math.prod(shape) and dtype.kind in "biufUS":
-                    columns[name] = npy.read_array(io.BytesIO(data), allow_pickle=False)
-    except DAMAGE as cause:
-        raise error(f"{path}: can't be read as .npz: {told(cause)}; wanted {WANTED}") from cause
+    with open_archive(path, error, WANTED) as archive:
+        for entry in archive.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if name not in names or entry.compress_type not in METHODS or entry.file_size > left:
+                continue
+            left -= entry.file_size
+            data = archive.read(entry)
+            if b"'|O'" in data[:128]:
+                continue
+            shape, dtype = check_npy(io.BytesIO(data), len(data))
+            if shape and max(shape) == math.prod(shape) and dtype.kind in "biufUS":
+                columns[name] = npy.read_array(io.BytesIO(data), allow_pickle=False)
     return columns
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, layout_of
+from refu_core.keypoints._layouts import POINTS_OF
 from refu_core.recordings._recording import Recording, tell_pace
 from refu_core.recordings._upright import Axes, to_smpl
 from refu_core.skeleton import PARENTS
@@ -23,9 +24,7 @@ _LEG = 0.82
 """Length of the mean body's leg, from hip to knee to ankle [m]."""
 _LEGS = (0.45, 1.1)
 """Shortest and longest leg of a person [m]; a unit that gives any other length can't be the file's."""
-_SMPL = "pelvis l_hip r_hip spine_low l_knee r_knee spine_mid l_ankle r_ankle spine_high l_foot r_foot neck l_clavicle "
-_SMPL += "r_clavicle head l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist"
-SMPL_POINTS = tuple(_SMPL.split())
+SMPL_POINTS = tuple(POINTS_OF["smpl24"].split()[:22])
 """SMPL's joints that SMPL-H and SMPL-X also have, by their names in the keypoint layouts."""
 _OF_SMPL = {"pelvis": "smpl_pelvis", "spine_low": "smpl_spine1", "spine_mid": "smpl_spine2"}
 _OF_SMPL |= {"spine_high": "smpl_spine3", "neck": "smpl_neck", "head": "smpl_head"}

@@ -15,7 +15,6 @@ from refu_core.recordings._rotations import BODY, WHOLE
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
 """Suffixes of files that hold motion."""
 
-
 ROOT_PLACES = ("root_translation", "root_trans", "root_transl")
 PELVIS_PLACES = ("root_trans_offset", "root_trans_world", "root_trans_cam")
 """Names of translations that are where the pelvis is, instead of how far the mesh is moved."""
@@ -191,14 +190,10 @@ def names_like(keys: Iterable[str | int]) -> Iterator[tuple[Layout, dict[str | i
                 key: _SPELLED.get(word.removeprefix(before), _SPELLED.get(word)) for word, key in by_spelling.items()
             }
             known |= {by_spelling[before + spelled(name)]: name for name in layout.pose}
-            yield (
-                layout,
-                {
-                    key: name
-                    for key, name in known.items()
-                    if name not in (None, key) and not _is_known(key, name, layout)
-                },
-            )
+            renamed = {
+                key: name for key, name in known.items() if name not in (None, key) and not _is_known(key, name, layout)
+            }
+            yield layout, renamed
 
 
 def _is_known(key: str | int, name: str, layout: Layout) -> bool:

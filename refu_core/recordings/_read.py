@@ -137,7 +137,7 @@ def _recording(
         at = places_in_time(numbers(len(array)), len(array), notes)
         places = places_of_mhr(array, transl_of(one(layout.transl), layout, len(array), notes), at)
         return follow(MHR_POINTS, places, fps=rate(), axes=axes, usual="y-down", worn=worn, notes=notes)
-    if layout.holds_places or _is_of_places(arrays):
+    if layout.holds_places or (len(arrays) == 1 and _are_places(*arrays.values())):
         ((name, array),) = arrays.items()
         notes.append(f"{name} {array.shape} holds places of joints and no rotations: SMPL's skeleton is fitted to them")
         places = array[:, : len(SMPL_POINTS)].astype(np.float64)
@@ -149,7 +149,7 @@ def _recording(
     transl = transl_of(one(layout.transl), layout, n, notes)
     scaling = one(table.SCALINGS)
     if scaling is not None:
-        if scaling.dtype.kind not in "iuf" or not scaling.size or not 1e-6 <= scaling.flat[0] <= 1e6:
+        if scaling.dtype.kind not in "iuf" or not scaling.size or not 1e-6 <= float(scaling.flat[0]) <= 1e6:
             raise ValueError(f"{table.SCALINGS[0]} must be a number in [1e-6, 1e6], got {scaling.reshape(-1)[:1]}")
         transl = transl / scaling.flat[0]
         notes.append(f"translations are divided by {table.SCALINGS[0]}")
@@ -206,15 +206,12 @@ def _by_time(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _checked(array: NDArray[Any], name: str) -> NDArray[Any]:
-    if not _is_of_places({name: array}):
+    if not _are_places(array):
         raise ValueError(f"{name}: no places of SMPL's joints, (T, n, 3) with n = 22 or 24, between which are bones")
     return array
 
 
-def _is_of_places(arrays: Mapping[str, NDArray[Any]]) -> bool:
-    if len(arrays) != 1:
-        return False
-    (array,) = arrays.values()
+def _are_places(array: NDArray[Any]) -> bool:
     is_alike = array.ndim == 3 and array.shape[1] in WHOLE and array.shape[2] == 3 and array.dtype.kind == "f"
     return is_alike and len(array) > 0 and are_places(array.astype(np.float64))
 

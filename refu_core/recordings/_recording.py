@@ -16,8 +16,6 @@ MAX_FRAMES = 1_000_000
 FASTEST, _FARTHEST = 12.0, 50.0
 """The fastest that people run [m/s], and the farthest they get from a recording's origin [m]. Translations in
 centimetres exceed it."""
-
-
 _JUMP = 0.75
 """A step of a frame that is farther and faster than people run is a jump [m]; trackers lose people there, too."""
 _OF_OTHERS = "several people's rows? say whose each is in a column, track_id; or the tracker lost the person there"

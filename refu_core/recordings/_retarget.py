@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.frames import N_BETAS
 from refu_core.keypoints import Proportions, layout_of
+from refu_core.recordings._upright import Array
 from refu_core.skeleton import JOINT_NAMES
-
-Array = NDArray[np.float64]
 
 _STRAIGHT = np.cos(np.radians(35.0))
 """A spine that bends by more in the rest pose doesn't say which way is up."""
@@ -63,8 +61,7 @@ class SourceSkeleton:
 
     def middle(self, name: str) -> Array:
         """The places between both sides of a point (T, 3)."""
-        middle: Array = (self.at(f"l_{name}") + self.at(f"r_{name}")) / 2
-        return middle
+        return (self.at(f"l_{name}") + self.at(f"r_{name}")) / 2
 
     def across(self, name: str) -> Array:
         """From the right side of a point to the left one (T, 3)."""
@@ -72,14 +69,19 @@ class SourceSkeleton:
 
     def bearer(self, name: str) -> int:
         """The joint that both sides of a point hang on, -1 if there is none."""
-        above, at = set(), self.points[f"l_{name}"]
-        while at >= 0:
-            at = self.parents[at]
-            above.add(at)
-        at = self.parents[self.points[f"r_{name}"]]
-        while at not in above:
-            at = self.parents[at]
-        return at
+        return bearer_of(self.parents, self.points[f"l_{name}"], self.points[f"r_{name}"])
+
+
+def bearer_of(parents: Sequence[int], a: int, b: int) -> int:
+    """The nearest joint that two joints hang on, -1 if there is none."""
+    above = set()
+    while a >= 0:
+        a = parents[a]
+        above.add(a)
+    b = parents[b]
+    while b not in above:
+        b = parents[b]
+    return b
 
 
 def _fitted_betas(source: SourceSkeleton, body: Proportions) -> Array:

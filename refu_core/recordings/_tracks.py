@@ -115,23 +115,31 @@ def _rows_apart(content: Content) -> Content:
 
 def _identified(content: Content, frame: Mapping[Key, Any]) -> list[dict[Key, Any]]:
     bodies = [entries(body) or {} for body in (entries(frame["smpl"]) or {}).values()]
-    names = content.array(frame["tid"]).reshape(-1).tolist() if bodies else []
-    return [{**body, "track_id": int(name)} for name, body in zip(names, bodies, strict=False)]
+    names = _ids(content, frame["tid"]) if bodies else []
+    return [{**body, "track_id": name} for name, body in zip(names, bodies, strict=False)]
 
 
 def _rows(content: Content, seen: Mapping[Key, Any]) -> Any:
     layout = next((one for one in table.LAYOUTS if one.is_in(seen)), None)
     if layout is None or _layout_of(content, seen) is not None:
         return seen
-    n = len(content.array(seen[layout.pose[0]]))
-    names = (*layout.arrays, *table.TRACK_IDS, "track_ids")
-    arrays = {name: content.array(seen[name]) for name in names if seen.get(name) is not None}
-    split = {name: array for name, array in arrays.items() if array.ndim and len(array) == n}
-    bodies: list[dict[Key, Any]] = [{} for _ in range(n)]
-    for name, array in split.items():
-        for body, row in zip(bodies, array, strict=True):
-            body[name if array.ndim > 1 else "track_id"] = row if array.ndim > 1 else int(row)
+    arrays = {name: content.array(seen[name]) for name in layout.arrays if seen.get(name) is not None}
+    n = next(iter(arrays[layout.pose[0]].shape), 0)
+    split = {name: array for name, array in arrays.items() if array.ndim > 1 and len(array) == n}
+    bodies: list[dict[Key, Any]] = [{name: array[i] for name, array in split.items()} for i in range(n)]
+    for key in (*table.TRACK_IDS, "track_ids"):
+        if seen.get(key) is not None and len(ids := _ids(content, seen[key])) == n:
+            for body, one in zip(bodies, ids, strict=True):
+                body["track_id"] = one
     return bodies
+
+
+def _ids(content: Content, value: Any) -> list[int]:
+    """The numbers that a tracker gives to people. Raises `ValueError` for anything else."""
+    given = content.array(value).reshape(-1)
+    if given.dtype.kind not in "biuf" or not np.isfinite(given).all():
+        raise ValueError(f"people's numbers must be whole, got {given.dtype} {given[:4].tolist()}; leave them out")
+    return [int(number) for number in given]
 
 
 def _layout_of(content: Content, node: Mapping[Key, Any]) -> table.Layout | None:

@@ -50,12 +50,11 @@ def betas_of(array: NDArray[Any] | None, n: int, notes: list[str], *, has_age: b
         age = float(np.median(rows[:, -1]))
         notes.append(f"the eleventh beta, a child's share of the shape ({age:.2g}), is left out: an adult's body")
     rows = rows[:, :N_BETAS]
-    if len(rows) > 1:
-        spread = float(np.ptp(rows, axis=0).max(initial=0.0))
-        if spread > _STEADY:
-            notes.append(f"betas differ by up to {spread:.2g} between frames: a person has one shape, the median")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which is refused below
+        spread = float(np.ptp(rows, axis=0).max(initial=0.0)) if len(rows) else 0.0
         betas[: rows.shape[1]] = np.median(rows, axis=0) if len(rows) else 0.0
+    if spread > _STEADY:
+        notes.append(f"betas differ by up to {spread:.2g} between frames: a person has one shape, the median")
     if not np.isfinite(betas).all():
         raise ValueError("betas has values that are NaN or infinite, or too large for float32")
     return betas

@@ -156,6 +156,7 @@ def test_a_garment_is_one_file(tmp_path: Path) -> None:
         ({"weights": np.zeros((2, 24))}, "weights: wanted finite numbers"),
         ({"v_template": np.full((2699, 3), np.nan)}, "v_template: wanted finite numbers"),
         ({"v_template": np.array("word")}, "v_template: wanted finite numbers"),
+        ({"v_template": np.full((5, 3), "x")}, "v_template: wanted finite numbers .*, got <U1"),
         ({"f": np.array([[0, 1, 2699]])}, "faces must index vertices 0 to 2698"),
     ],
 )

@@ -59,6 +59,8 @@ def test_sigma_is_that_of_the_errors(tmp_path: Path) -> None:
         load_sigma(load_garment("tshirt-male"), folder=tmp_path)
     with pytest.raises(MeshError, match="σ needs 30 samples or more, got 9"):
         fit_sigma(garment, errors[:9], poses[:9])
+    with pytest.raises(MeshError, match=r"wanted finite errors .* and poses"):
+        fit_sigma(garment, errors, np.where(np.arange(300)[:, None, None] == 7, np.nan, poses))
 
 
 def test_of_somebody_who_lies_little_is_known(pipeline: GarmentPipeline) -> None:

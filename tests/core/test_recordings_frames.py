@@ -58,6 +58,31 @@ def test_frames_become_a_clip(form: str, tmp_path: Path) -> None:
     assert ("2 persons" in said) == ("people" in form or "person" in form)
 
 
+ODD_ROWS: dict[str, dict[str, Any]] = {
+    "an infinite number of a person": romp(0) | {"track_ids": np.array([np.inf, 1.0])},
+    "the same beside bodies": {"smpl": [person(0)], "tid": np.array([np.inf])},
+    "a pose that is a number": {"smpl_thetas": np.ones(())},
+}
+
+
+@pytest.mark.parametrize("form", ODD_ROWS)
+def test_odd_rows_of_an_image_are_refused(form: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps({f"{i}.jpg": ODD_ROWS[form] for i in range(3)}))
+    with pytest.raises(
+        MotionFileError, match="smpl_thetas must be" if "pose" in form else "people's numbers must be whole"
+    ):
+        read_motion(path, fps=30)
+
+
+def test_ten_people_of_one_shape_keep_their_names(tmp_path: Path) -> None:
+    """A shape's ten numbers are no numbers of ten people."""
+    poses = np.zeros((10, 72)) + 0.1
+    row = {"smpl_thetas": poses, "smpl_betas": np.arange(10.0), "track_ids": np.arange(10, 20)}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({f"{i}.jpg": row for i in range(T)}))
+    assert len(read_motion(tmp_path / "a.pkl", fps=30, person="17")) == T
+
+
 def test_people_without_names_are_told_apart_by_where_they_are() -> None:
     here, there, nowhere = np.zeros(3), np.array([2.0, 0, 0]), np.full(3, np.nan)
     seen = [[("", nowhere), ("a", here)], [("", here)], [("1", there)], [("", np.array([9.0, 0, 0]))]]
