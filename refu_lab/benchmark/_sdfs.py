@@ -214,8 +214,8 @@ def _clips(motions: Path | None, bags: Path) -> Iterator[Stretch]:
         return
     for name in _MOTION_BAGS:
         if (bags / name).is_dir():
-            with adapters.open_smpl_bag(bags / name) as bag:
-                yield [record.frame for record in bag if record.frame is not None]
+            records = adapters.iter_smpl_frames(bags / name)
+            yield [record.frame for record in records if record.frame is not None]
 
 
 def moments(stretches: Sequence[Stretch], pipeline: GarmentPipeline) -> list[Window]:
