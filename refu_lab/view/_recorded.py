@@ -109,7 +109,7 @@ class MarkerScene(Generic[_Kept]):
         return max((marker.stamp_ns or now_ns for marker in drawable), default=0), len(meshes) - len(drawable)
 
     def shape(self, marker: Marker) -> SceneMesh:
-        """The shape of a marker of triangles; those of one namespace, told apart by their ids, have different names."""
+        """The shape of a marker of triangles."""
         key, points = (marker.ns, marker.id), marker.points
         topology = self._topologies.get(key)
         if topology is None or not topology.fits(points):
@@ -118,7 +118,6 @@ class MarkerScene(Generic[_Kept]):
         if self._origin is None:
             self._origin = vertices[0].copy()
         person, _, name = marker.ns.rpartition("/")
-        name = f"{name}-{marker.id}" if marker.id else name
         color = (marker.color[0], marker.color[1], marker.color[2])
         return SceneMesh(name, person, (vertices - self._origin).astype(np.float32), topology.faces, color)
 

@@ -172,14 +172,17 @@ def test_markers_that_make_no_picture_are_left_out_and_a_rotation_unset_is_none(
         assert not is_drawable(odd)
 
 
-def test_markers_that_differ_by_their_ids_alone_are_shown_side_by_side(server: Any) -> None:
-    """As other senders have it: parts of one thing, or people, counted in one namespace."""
+def test_markers_that_differ_by_their_topics_or_ids_alone_are_shown_side_by_side(server: Any) -> None:
+    """As two nodes have them, or other senders: parts of one thing, or people, counted in one namespace."""
     scene: MarkerScene[SceneMesh] = MarkerScene(lambda shape: shape)
-    (whole,) = adapters.decode_marker_array(triangle("ann/shirt", 1))
-    shapes = [scene.shape(replace(whole, id=i, pose=(float(i), *whole.pose[1:]))) for i in (0, 1, 7)]
+    for topic in ("/ann/garments", "/bob/garments"):
+        scene.take(topic, triangle("shirt", 1), 0)
+    shirts = [replace(shape, vertices=shape.vertices + i) for i, shape in enumerate(scene.shown(1))]
     stage = Stage(server)
-    stage.draw([(shape, [Band(shape.faces, shape.color)]) for shape in shapes], wireframe=False)
-    assert [*stage._drawn] == [("ann", name, 0) for name in ("shirt", "shirt-1", "shirt-7")]
+    for shown in (shirts, shirts[1:], shirts):
+        stage.draw([(shape, [Band(shape.faces, shape.color)]) for shape in shown], wireframe=False)
+        found = [one.mesh.vertices for one in stage._drawn.values()]
+        np.testing.assert_array_equal(found, [shape.vertices for shape in shown])
 
 
 def test_meshes_that_stay_for_ever_are_forgotten_in_the_end() -> None:
