@@ -33,8 +33,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def _frames() -> list[SmplFrame]:
-    with adapters.open_smpl_bag(ROOT / "bags" / "walk") as bag:
-        return [record.frame for record in bag if record.frame is not None]
+    records = adapters.iter_smpl_frames(ROOT / "bags" / "walk")
+    return [record.frame for record in records if record.frame is not None]
 
 
 def _write(path: Path, frames: list[SmplFrame], count: int, first: int) -> None:

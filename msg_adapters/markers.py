@@ -91,7 +91,6 @@ LINE_STRIP, POINTS, TRIANGLE_LIST = 4, 8, 11
 ADD, DELETE, DELETE_ALL = 0, 2, 3
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _LEAD_BYTES = 4  # before the header, so that the payload, and with it every float64, lies on a multiple of 8
-_NO_COLOR: Rgba = (0.0, 0.0, 0.0, 0.0)
 _NO_POINTS = np.zeros((0, 3))
 
 
@@ -102,7 +101,7 @@ def _write_marker(
     frame_id: str,
     action: int = ADD,
     stamp_ns: int = 0,
-    color: Rgba = _NO_COLOR,
+    color: Rgba = (0.0, 0.0, 0.0, 0.0),
     points: NDArray[Any] = _NO_POINTS,
     kind: int = TRIANGLE_LIST,
     size: float = 1.0,

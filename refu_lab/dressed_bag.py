@@ -54,7 +54,7 @@ class DressedBag:
         given = None if source.bag is None else source.bag.topic
         own: dict[str, Any] = {}
         if given is not None:
-            own = {"definition": given.definition, "type_hash": given.type_hash, "betas_of": given.betas_of}
+            own = {"definition": given.definition or None, "type_hash": given.type_hash, "betas_of": given.betas_of}
         self._writer.add_topic(source.topic, source.message_type, **own)
         self._writer.add_topic(GARMENTS_TOPIC, adapters.MARKER_ARRAY)
         self._writer.add_topic(DIAGNOSTICS_TOPIC, adapters.DIAGNOSTIC_ARRAY)

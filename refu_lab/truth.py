@@ -95,10 +95,8 @@ def moments_of(bag: Path, garment: GarmentTemplate) -> list[TrueFrame]:
     """
     truth = GroundTruth.of_bag(bag, {garment.name: garment.faces.cpu().numpy()})
     found, history = [], PoseHistory()
-    with adapters.open_smpl_bag(bag) as opened:
-        for record in opened:
-            if record.frame is None:
-                continue
+    for record in adapters.iter_smpl_frames(bag):
+        if record.frame is not None:
             frame, true = history(record.frame), truth.of(garment.name, record.frame)
             if true is not None:
                 found.append((frame, true))

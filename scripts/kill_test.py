@@ -225,11 +225,7 @@ def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
     rng, result = random.Random(seed), Result()
     place = folder / "work"
     while result.kills < times:
-        seconds = rng.uniform(0, work.longest_s)
-        child = os.fork()
-        if child == 0:
-            _work_and_exit(work, place)
-        status = _wait(child, seconds)
+        status = _status_of(work, place, rng.uniform(0, work.longest_s))
         try:
             if status is None:
                 result.kills += 1
@@ -242,10 +238,7 @@ def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
         except Exception as error:
             result.failures.append(f"{type(error).__name__}: {error}")
             shutil.rmtree(place, ignore_errors=True)
-    child = os.fork()
-    if child == 0:
-        _work_and_exit(work, place)
-    if _wait(child, 1.0 if what == "recording" else 600.0) == 0:
+    if _status_of(work, place, 1.0 if what == "recording" else 600.0) == 0:
         work.check_finished(place)
         result.finished += 1
     return result
@@ -264,8 +257,11 @@ def _work_and_exit(work: Any, place: Path) -> None:
         os._exit(status)
 
 
-def _wait(child: int, seconds: float) -> int | None:
-    """The exit status of a process, or None where it didn't end in time and was killed."""
+def _status_of(work: Any, place: Path, seconds: float) -> int | None:
+    """The exit status of a process that does the work, or None where it didn't end in time and was killed."""
+    child = os.fork()
+    if child == 0:
+        _work_and_exit(work, place)
     end = time.monotonic() + seconds
     while True:
         pid, status = os.waitpid(child, os.WNOHANG)

@@ -44,10 +44,10 @@ class QosProfile:
             "depth": self.depth,
             "reliability": self.reliability,
             "durability": "volatile",
-            "deadline": dict(_FOREVER),
-            "lifespan": dict(_FOREVER),
+            "deadline": _FOREVER,
+            "lifespan": _FOREVER,
             "liveliness": "automatic",
-            "liveliness_lease_duration": dict(_FOREVER),
+            "liveliness_lease_duration": _FOREVER,
             "avoid_ros_namespace_conventions": False,
         }
 

@@ -58,31 +58,24 @@ class PaperStructure:
         """Builds it for a garment and its body, on the body's device."""
         settings = settings or PaperSettings()
         self._dtype = settings.dtype
-        self._garment, self._body, device = garment, body, body.device
+        self._garment, self._body = garment, body
         backbone = build_backbone(
-            backbone_config("tailornet", self._garment, preset="paper"),
+            backbone_config("tailornet", garment, preset="paper"),
             garment.to(device="cpu"),
             pivots=torch.randn(settings.pivots, N_BETAS + N_STYLES),
         )
         # Sizes of ReFU's networks h and g. Here k is one dense layer, evaluated for all vertices in one product.
         sizes = replace(PAPER, feature_size=settings.width, hidden_size=settings.width, is_compact=True)
-        n = self._garment.n_vertices
-        backbone = backbone.to(device, self._dtype).eval().requires_grad_(False)
-        self._networks: list[nn.Module] = [backbone]
-        wearable = Wearable(self._garment, _LowPrecision(backbone, self._dtype), None, margin=0.0)
-        self._outfit = Outfit(self._body, {garment.name: wearable})
-        self._distance = (
-            SdfNetwork(SdfNetworkConfig(width=settings.width)).to(device, self._dtype).requires_grad_(False)
-        )
-        self._scale = ScaleNet(n, least=0.0, settings=sizes).to(device, self._dtype).requires_grad_(False)
-        self._k = nn.Linear(settings.width, n * PAPER.latent_size).to(device, self._dtype).requires_grad_(False)
+        self._distance = SdfNetwork(SdfNetworkConfig(width=settings.width))
+        self._scale = ScaleNet(garment.n_vertices, least=0.0, settings=sizes)
+        self._k = nn.Linear(settings.width, garment.n_vertices * PAPER.latent_size)
+        networks = nn.ModuleList((backbone, self._distance, self._scale, self._k))
+        networks.to(body.device, self._dtype).eval().requires_grad_(False)
+        self.n_parameters = sum(p.numel() for p in networks.parameters())
+        wearable = Wearable(garment, _LowPrecision(backbone, self._dtype), None, margin=0.0)
+        self._outfit = Outfit(body, {garment.name: wearable})
         self.stages: list[dict[str, float]] = []
         """Time of each stage in each frame, by whichever clock `time.perf_counter` reads [ms]."""
-
-    @property
-    def n_parameters(self) -> int:
-        networks = (*self._networks, self._distance, self._scale, self._k)
-        return sum(p.numel() for network in networks for p in network.parameters())
 
     @torch.no_grad()
     def __call__(self, frame: SmplFrame) -> NDArray[np.float32]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +87,7 @@ def sdf_methods(
         winding = _ours(ExactSdf(faces, sign="winding", rebuild_distance=math.inf), body, device)
         methods.append(SdfMethod("exact, sign by winding number", "other", winding, is_slow=True))
         for name, module, package, make, is_slow in _OTHERS:
-            if importlib.util.find_spec(module) is None:
+            if find_spec(module) is None:
                 missing[name] = f"pip install {package}"
             else:
                 methods.append(SdfMethod(name, "other", make(faces), is_slow=is_slow))
@@ -140,7 +139,8 @@ def _ours(sdf: BodySdf, body: SmplBody, device: str, *, rest_faces: RestFaces | 
 
 
 def _libigl(faces: NDArray[np.int32]) -> Ask:
-    igl: Any = importlib.import_module("igl")
+    import igl
+
     indices = faces.astype(np.int64)
 
     def ask(frame: SdfFrame) -> Any:
@@ -153,7 +153,7 @@ def _libigl(faces: NDArray[np.int32]) -> Ask:
 
 
 def _trimesh(faces: NDArray[np.int32]) -> Ask:
-    trimesh: Any = importlib.import_module("trimesh")
+    import trimesh
 
     def ask(frame: SdfFrame) -> Any:
         mesh = trimesh.Trimesh(frame.body, faces, process=False)
@@ -214,8 +214,8 @@ def _clips(motions: Path | None, bags: Path) -> Iterator[Stretch]:
         return
     for name in _MOTION_BAGS:
         if (bags / name).is_dir():
-            with adapters.open_smpl_bag(bags / name) as bag:
-                yield [record.frame for record in bag if record.frame is not None]
+            records = adapters.iter_smpl_frames(bags / name)
+            yield [record.frame for record in records if record.frame is not None]
 
 
 def moments(stretches: Sequence[Stretch], pipeline: GarmentPipeline) -> list[Window]:

@@ -209,7 +209,6 @@ def plot_time_against_error(result: BenchmarkResult, folder: Path) -> Path | Non
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     garment, core = shown[0].garment, result.machine.get("processor", "")
     figure.suptitle(f"{garment}, bytes to bytes on one core ({core}); * other hardware, garments and data", fontsize=9)
-    folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / PLOT, dpi=130, metadata={"Software": None})
     return folder / PLOT
 

@@ -7,7 +7,6 @@ one and gives the same result there, which depends only on the task's content.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
 import logging
 import os
@@ -15,7 +14,7 @@ import pickle
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from itertools import islice
@@ -185,7 +184,7 @@ def _work(packed: bytes, digest: str, task: bytes, version: str, folder: str) ->
 
     So relative paths mean the same as for the command, wherever the disk is shared.
     """
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         os.chdir(folder)
     if version != __version__:
         raise FleetError(f"a worker has refu-ros {__version__}, this is {version}: install one version everywhere")

@@ -107,7 +107,7 @@ def _find(text: str) -> Iterator[str]:
 def _walk(steps: Iterable[tuple[str, Any, Iterable[str]]], folder: str) -> Iterator[str]:
     """Recordings in a folder, from the steps of `os.walk`; the folder itself if it is a bag."""
     bags: list[PurePosixPath] = []
-    for place, _, files in sorted((PurePosixPath(place), None, [*files]) for place, _, files in steps):
+    for place, files in sorted((PurePosixPath(place), [*files]) for place, _, files in steps):
         is_hidden = any(part.startswith(".") for part in place.relative_to(folder).parts)
         if is_hidden or any(bag in place.parents for bag in bags):
             continue

@@ -6,12 +6,11 @@ or a run that resumes this one, finds all of it or nothing.
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import tempfile
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -143,7 +142,7 @@ class Folder:
             return
         folder = Path(self.place)
         msg = f"{self.place}: another run writes into this folder; wait for it, or give another one"
-        with contextlib.ExitStack() as stack:
+        with ExitStack() as stack:
             with self._errors():
                 folder.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(exclusive(folder / ".lock", error=RefuError(msg)))

@@ -13,6 +13,7 @@ from refu_core.errors import printable
 from refu_lab.tables import REPLAY_TITLE, format_table, html_page, html_table, meanings, replay_columns
 
 _HEADER = ("recording", "frames", "skipped", "p50 ms", "p95 ms", "VFCP %", "free %", "depth mm", "")
+_FIGURES = (("vfcp_percent", 3), ("free_percent", 1), ("max_depth_mm", 1))
 _WORST_HEADER = ("recording", "frame", "time s", "inside", "pairs", "depth mm")
 _SHOWN = 10
 """How many worst frames over all recordings, and how many warnings, are shown."""
@@ -118,18 +119,8 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
         return (printable(row["name"]), *["-"] * (len(_HEADER) - 2), "failed")
     latency = [f"{row['latency_ms'][p]:.1f}" for p in ("p50", "p95")]
     figures = ["-" if row.get(name) is None else f"{row[name]:.{digits}f}" for name, digits in _FIGURES]
-    skipped = str(sum(row["skipped"].values()))
-    return (
-        printable(row["name"]),
-        str(row["frames"]),
-        skipped,
-        *latency,
-        *figures,
-        "before" if row.get("kept") else "done",
-    )
-
-
-_FIGURES = (("vfcp_percent", 3), ("free_percent", 1), ("max_depth_mm", 1))
+    counts = (str(row["frames"]), str(sum(row["skipped"].values())))
+    return (printable(row["name"]), *counts, *latency, *figures, "before" if row.get("kept") else "done")
 
 
 def _worst_cells(frame: Mapping[str, Any]) -> tuple[str, ...]:

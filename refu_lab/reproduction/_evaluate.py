@@ -44,9 +44,6 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     `engine` runs the methods, a block of samples a task; this process alone makes the tables sdf, time and motion.
     Raises `RefuError`: nothing to make them from, an input that can't be read, or results that can't be written.
     """
-    if not options.data and (options.table not in ("all", "motion") or options.motions is None):
-        need = "--motions DIR" if options.table == "motion" else "--data DIR"
-        raise RefuError(f"nothing to evaluate: the table {options.table} needs {need}")
     page = options.output / "README.md"
     if page.exists() and not is_summary(page):
         raise RefuError(f"{page}: is there already, and no page of refu evaluate; name another folder with --output")
@@ -60,8 +57,9 @@ def evaluate(options: EvaluateOptions, *, progress: bool, engine: Engine | None 
     wanted = [name for name in RESULT_TABLES if options.table in ("all", name) and has_data[name]]
     if not wanted:
         kind = "sequences (refu simulate --sequences)" if options.table == "sequence" else "poses"
-        need = "--motions DIR" if options.table == "motion" else f"a data set of {kind} in --data"
-        raise RefuError(f"the table {options.table} needs {need}")
+        of_data = f"a data set of {kind} in --data" if options.data else "--data DIR"
+        need = "--motions DIR" if options.table == "motion" else of_data
+        raise RefuError(f"nothing to evaluate: the table {options.table} needs {need}")
     library = Library(options.weights, collider=options.collider, body=options.body)
     how: dict[str, Any] = {"library": library, "progress": progress}
     output, n_posed = options.output, {samples.garment: len(samples) for samples in posed}

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 from refu_core.body import load_fit
 from refu_core.errors import WeightsError
@@ -71,6 +71,7 @@ _TRAINING: Mapping[str, str] = {
 SEQUENCE_SHAPES = (5, 17)
 """Numbers of body shapes in the paper's two sets of sequences."""
 _SDFS: tuple[SdfName, ...] = ("approx", "accurate")
+_POST_PROCESSES: tuple[Handling, ...] = ("naive", "optimisation")
 _RUN_TIME_SDF: Mapping[str, SdfName] = {"approx": "approx", "accurate": "accurate", "hybrid": "approx"}
 """Hybrid uses the accurate distance in the training loss, the approximate one in ReFU (paper, Sec. "Settings")."""
 
@@ -78,19 +79,10 @@ _RUN_TIME_SDF: Mapping[str, SdfName] = {"approx": "approx", "accurate": "accurat
 def _methods() -> Iterator[Method]:
     skinned = Method("skinned", "skinned template (no network)", backbone="skinned", base="skinned")
     yield skinned
-    for name, mode, handling, label in (
-        ("skinned-naive", "none", "naive", "skinned, naive post-process"),
-        ("skinned-optimisation", "none", "optimisation", "skinned, optimisation post-process"),
-        ("node-skinned", "accurate", "node", "the node, skinned"),
-    ):
-        yield replace(
-            skinned,
-            name=name,
-            label=f"{label}, accurate",
-            mode=mode,
-            handling=cast("Handling", handling),
-            sdf="accurate",
-        )
+    accurate = replace(skinned, sdf="accurate")
+    for post in _POST_PROCESSES:
+        yield replace(accurate, name=f"skinned-{post}", label=f"skinned, {post} post-process, accurate", handling=post)
+    yield replace(accurate, name="node-skinned", label="the node, skinned, accurate", mode="accurate", handling="node")
     yield Method("tailornet", "backbone alone (TailorNet)")
     for sdf in _SDFS:
         drape = Method(f"optimisation-{sdf}", f"optimisation post-process, {sdf}", handling="optimisation", sdf=sdf)

@@ -8,7 +8,7 @@ import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from refu_core._files import read_json
 from refu_core._versions import versions
@@ -279,7 +279,7 @@ def write_summary(folder: Path) -> Path:
     A text about the folder as a whole is taken from its `about.txt`. Raises `RefuError`: a file that isn't a table, or
     a folder that can't be written.
     """
-    tables: dict[str, Any] = {name: read_table(folder, name) for name in RESULT_TABLES}
+    tables = {name: read_table(folder, name) for name in RESULT_TABLES}
     links = [
         f"- not made yet: `refu evaluate --table {name}`" if table is None else f"- [{table.title}]({name}.md)"
         for name, table in tables.items()
@@ -293,8 +293,7 @@ def write_summary(folder: Path) -> Path:
     about = folder / "about.txt"
     parts = ["# Results", _SUMMARY, *([about.read_text(encoding="utf-8").strip()] if about.exists() else [])]
     parts += ["\n".join(links), _PAPER_NOTE]
-    main: ResultTable | None = tables["comparison"]
-    if main is not None:
+    if (main := tables["comparison"]) is not None:
         grids = main.in_short()
         parts += [f"## {grids[0].title}", *(grid.markdown() for grid in grids)]
     pictures = [plot for table in tables.values() if table is not None for plot in table.plots]

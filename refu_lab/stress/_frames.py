@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from refu_core.body import JOINT_NAMES
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
 from refu_core.realtime import PROMISED_BEND, PROMISED_POSES, PROMISED_SIZE, SPINE, spine_bend
+from refu_core.recordings import interpolated
 
 Draw = Callable[[np.random.Generator], SmplFrame]
 frame_of: Callable[..., SmplFrame] = SmplFrame  # typed loosely: it converts numbers of any kind
@@ -160,10 +160,7 @@ FRAMES: Mapping[str, Draw] = {
 
 def between(poses: Sequence[NDArray[np.floating]], steps: int) -> list[NDArray[np.float64]]:
     """Goes from each pose (24, 3) [rad] to the next in `steps` on the shorter arc, without the last pose itself."""
-    motion = []
-    for first, last in pairwise(poses):
-        turns = [Slerp([0, 1], Rotation.from_rotvec(np.stack([first[j], last[j]]))) for j in range(N_JOINTS)]
-        # Eased in and out, so that the speed has no jumps.
-        eased = 0.5 - 0.5 * np.cos(np.pi * np.arange(steps) / steps)
-        motion += [np.stack([turn(t).as_rotvec() for turn in turns]) for t in eased]
-    return motion
+    eased = 0.5 - 0.5 * np.cos(np.pi * np.arange(steps) / steps)  # in and out, so that the speed has no jumps
+    moments = np.add.outer(np.arange(len(poses) - 1), eased).ravel()
+    motion, _ = interpolated(np.stack(poses), np.zeros((len(poses), 3)), np.arange(len(poses)), moments)
+    return [*motion]

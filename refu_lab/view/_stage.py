@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -28,7 +29,7 @@ _SKY, _EARTH, _SUN = (236, 242, 255), (176, 166, 156), (255, 244, 228)
 _GROUND, _LINES, _SECTIONS = (238, 239, 241), (214, 217, 222), (190, 195, 203)
 
 Key = tuple[str, str, int]
-"""Names of person and shape, and number of the band."""
+"""Names of person and shape, and number of the band among all of these names."""
 
 
 @dataclass(eq=False)
@@ -110,9 +111,12 @@ class Stage:
         """Shows these bands, and nothing else."""
         with self._server.atomic():
             left = set(self._drawn)
+            counts: Counter[tuple[str, str]] = Counter()  # markers may differ by their topics or ids alone
             for shape, parts in bands:
-                for number, band in enumerate(parts):
-                    key = (shape.person, shape.name, number)
+                names = shape.person, shape.name
+                for band in parts:
+                    key = (*names, counts[names])
+                    counts[names] += 1
                     if len(band.faces):
                         left.discard(key)
                         self._put(key, shape, band, wireframe=wireframe)

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from asset_tools.surfaces import Faces, Vertices, boundary_loops
+from asset_tools.surfaces import Faces, Vertices, boundary_loops, compact
 from refu_core.mesh import face_normals, vertex_normals
 
 Sizing = Callable[[Vertices], NDArray[np.float64]]
@@ -80,9 +80,7 @@ class _Mesh:
     def neighbours(self, a: int) -> set[int]:
         return {x for face in self.around[a] for x in self.faces[face]} - {a}
 
-    def normal(
-        self, face: tuple[int, int, int], moved: dict[int, NDArray[np.float64]] | None = None
-    ) -> NDArray[np.float64]:
+    def normal(self, face: Face, moved: dict[int, NDArray[np.float64]] | None = None) -> NDArray[np.float64]:
         p = [moved[x] if moved and x in moved else self.points[x] for x in face]
         return _cross(p[1] - p[0], p[2] - p[0])
 
@@ -212,21 +210,16 @@ class _Mesh:
             centre = (np.roll(p, 1, 0) + np.roll(p, -1, 0)) / 2
             curve = min(curves, key=lambda c: closest_on_polyline(p[:1], c)[1][0])
             v[loop] = closest_on_polyline((p + centre) / 2, curve)[0]
-        target = trimesh.proximity.closest_point(surface, (v + 0.8 * step)[inner])[0]
-        v[inner] = target
-        for i, p in zip(used, v, strict=True):
-            self.points[i] = p
-        for i, s in zip(used, self.sizing(v), strict=True):
-            self.size[i] = float(s)
+        v[inner] = trimesh.proximity.closest_point(surface, (v + 0.8 * step)[inner])[0]
+        for i, p, s in zip(used, v, self.sizing(v), strict=True):
+            self.points[i], self.size[i] = p, float(s)
 
     def _local(self) -> tuple[Vertices, Faces, NDArray[np.int64]]:
-        f = np.array([self.faces[i] for i in sorted(self.faces)], dtype=np.int64)
-        used, local = np.unique(f, return_inverse=True)
-        return np.array([self.points[i] for i in used]), local.reshape(-1, 3), used
+        used, f = compact(np.array([self.faces[i] for i in sorted(self.faces)], dtype=np.int64))
+        return np.array([self.points[i] for i in used]), f, used
 
     def arrays(self) -> tuple[Vertices, Faces]:
-        v, f, _ = self._local()
-        return v, f
+        return self._local()[:2]
 
 
 def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ import os
 import pickle
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -139,6 +140,22 @@ def test_the_output_shows_who_wears_it_and_says_how_it_fits(small_bag: Path, tmp
     assert [message for message in raw_messages(bare) if message[0] != "/diagnostics"] == kept
     said = {ros.status[1].message for _, _, ros in decoded(bare, "/diagnostics")}
     assert said == {"no vertex inside the body"}
+
+
+def test_input_of_a_bag_without_definitions_can_be_decoded_in_the_output(small_bag: Path, tmp_path: Path) -> None:
+    """ROS 2 wrote none into `.db3` before Iron."""
+    old = tmp_path / "old.db3"
+    with sqlite3.connect(old) as database:
+        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
+        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
+        topic = (1, "/smpl_params", adapters.INPUT_TYPES["joint_state"], "cdr")
+        database.execute("INSERT INTO topics VALUES (?, ?, ?, ?)", topic)
+        rows = [(1, one.log_time_ns, one.data) for one in adapters.BagReader(small_bag).messages()]
+        database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+    database.close()
+    assert run(old, "--output", tmp_path / "out.mcap", "--no-evaluate") == 0
+    messages = decoded(tmp_path / "out.mcap", "/smpl_params")
+    assert [len(message.name) for _, _, message in messages] == [85] * len(rows)
 
 
 @pytest.mark.parametrize("bag", SHIPPED, ids=lambda path: path.name)

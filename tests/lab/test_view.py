@@ -33,9 +33,10 @@ from refu_lab.commands.view import ViewOptions
 from refu_lab.view import view
 from refu_lab.view._dressed import DressedFilm, PersonMotion
 from refu_lab.view._film import BODY, SKIN, SceneMesh
-from refu_lab.view._marks import CLEARANCE, BandFinder, Marking
+from refu_lab.view._marks import CLEARANCE, Band, BandFinder, Marking
 from refu_lab.view._player import Player
 from refu_lab.view._recorded import MarkerScene, RecordedFilm, Topology, is_drawable
+from refu_lab.view._stage import Stage
 from refu_lab.view._view import _serve, open_film
 
 ROOT = Path(__file__).parents[2]
@@ -169,6 +170,19 @@ def test_markers_that_make_no_picture_are_left_out_and_a_rotation_unset_is_none(
         replace(whole, pose=(0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 1.0)),
     ):
         assert not is_drawable(odd)
+
+
+def test_markers_that_differ_by_their_topics_or_ids_alone_are_shown_side_by_side(server: Any) -> None:
+    """As two nodes have them, or other senders: parts of one thing, or people, counted in one namespace."""
+    scene: MarkerScene[SceneMesh] = MarkerScene(lambda shape: shape)
+    for topic in ("/ann/garments", "/bob/garments"):
+        scene.take(topic, triangle("shirt", 1), 0)
+    shirts = [replace(shape, vertices=shape.vertices + i) for i, shape in enumerate(scene.shown(1))]
+    stage = Stage(server)
+    for shown in (shirts, shirts[1:], shirts):
+        stage.draw([(shape, [Band(shape.faces, shape.color)]) for shape in shown], wireframe=False)
+        found = [one.mesh.vertices for one in stage._drawn.values()]
+        np.testing.assert_array_equal(found, [shape.vertices for shape in shown])
 
 
 def test_meshes_that_stay_for_ever_are_forgotten_in_the_end() -> None:
