@@ -99,12 +99,13 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
         (n := recent["drop.stale_transforms"], WARN, f"{n} messages of transforms weren't read: too many come"),
         (n := recent["drop.transform"], WARN, f"{n} of {received} have no transform: {reasons['transform']}"),
         (n := recent["drop.crowd"], WARN, f"{n} frames of people beyond the first: {reasons['crowd']}"),
-        (silent_for is None and waited > _FIRST_INPUT_S, WARN, "no input yet"),
+        (silent_for is None and waited > _FIRST_INPUT_S, WARN, now.doubted or "no input yet"),
         (n := recent["back_in_time"], WARN, f"{n} stamps went back: {_WENT_BACK}"),
     ]
     if missing and not recent["skip.unwatched"] and silent_for is not None and waited > _FIRST_INPUT_S:
         nobody = received and not persons
-        rules.append((True, WARN, f"nobody is here, though {received} messages came" if nobody else silence))
+        text = f"nobody is here, though {received} messages came" if nobody else silence
+        rules.append((True, WARN, "; ".join(filter(None, (text, now.doubted)))))
     if now.is_untransformed and now.input_frame:
         frames = f"{now.input_frame} is taken for {settings.frame_id}"
         rules.append((True, WARN, f"{frames}: install tf2_msgs, or set frame_id if they are the same place"))

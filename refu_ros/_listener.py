@@ -105,9 +105,13 @@ class Listener:
         """Doubts about the people who are here, or about topics with several senders; empty if there are none."""
         here = () if self.scene is None else self.scene.persons
         found = [text for person in here if (text := self.doubts.of_senders.get(person))]
-        for name, subscription in self._inputs.items():
-            if not name.startswith("/") and (n := self._node.count_publishers(subscription.topic_name)) > 1:
-                found.append(f"{n} publishers on {subscription.topic_name}: who leaps may be two people")
+        senders = self._node.guarded("names of topics", self._node.get_publishers_info_by_topic, lambda *_: [])
+        for topic in [one.topic_name for name, one in self._inputs.items() if not name.startswith("/")]:
+            kinds, kind = [one.topic_type for one in senders(topic)], self.stream.message_type
+            others = sorted({*kinds} - {kind})
+            found += [f"{topic} is sent as {one}, but input_type wants {kind}: change one of them" for one in others]
+            if (n := kinds.count(kind)) > 1:
+                found.append(f"{n} publishers on {topic}: who leaps may be two people")
         return "; ".join(found)
 
     @property

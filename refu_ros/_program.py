@@ -56,7 +56,8 @@ def run(
         rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
         return live()
     except Exception as error:
-        return _refuse(program, str(error))
+        is_bare = "UnknownROSArgs" in type(error).__name__  # rclpy's: nothing but a list
+        return _refuse(program, f"no such arguments after --ros-args: {error}" if is_bare else str(error))
     finally:
         rclpy.try_shutdown()
         _on_signals(signal.SIG_IGN)  # an impatient second Ctrl-C mustn't change the exit status

@@ -40,9 +40,7 @@ class NodeSettings(DressOptions):
     Raises `SettingsError` for a value out of range and for values that can't go together.
     """
 
-    threads: int = fixed(
-        2, "Frames, or people of a frame, processed at the same time; on a GPU only people.", within=(1, 64)
-    )
+    threads: int = fixed(2, "Frames, or people of a frame, processed at once; on a GPU only people.", within=(1, 64))
     on_device_loss: str = setting(
         "cpu", "When the device fails: continue on the cpu, with an ERROR, or stop the node.", choices=("cpu", "stop")
     )
@@ -52,9 +50,7 @@ class NodeSettings(DressOptions):
     keypoints: str = setting(
         "zed38", "Which points of the body the tracker sends, if input_type is one of keypoints.", choices=LAYOUTS
     )
-    keypoint_rate: float = fixed(
-        0.0, "Rate of poses predicted from keypoints [Hz]; 0: one per message.", within=(0.0, 240.0)
-    )
+    keypoint_rate: float = fixed(0.0, "Rate of poses from keypoints [Hz]; 0: one per message.", within=(0.0, 240.0))
     keypoint_smoothing: float = setting(
         1.0, "For poses from keypoints: 2 is smoother and later, 0.5 is quicker.", within=(0.1, 10.0)
     )
@@ -85,12 +81,8 @@ class NodeSettings(DressOptions):
     )
     person_timeout: float = setting(1.0, "A person silent for this long leaves the scene [s].", within=(0.05, 3600.0))
     max_rate: float = setting(0.0, "Most frames a second [Hz]; 0: no limit.", within=(0.0, 1e3))
-    marker_lifetime: float = setting(
-        2.0, "Viewers drop a garment that isn't renewed for this long [s]; 0: never.", within=(0.0, 1e6)
-    )
-    max_distance: float = setting(
-        0.0, "People farther from the origin of frame_id aren't dressed [m]; 0: no limit.", within=(0.0, 1e6)
-    )
+    marker_lifetime: float = setting(2.0, "Viewers drop what is older than this [s]; 0: never.", within=(0.0, 1e6))
+    max_distance: float = setting(0.0, "Nobody farther from frame_id is dressed [m]; 0: no limit.", within=(0.0, 1e6))
     record: str = setting("", "Bag to record inputs, garments and diagnostics to; empty: none.", metavar="DIR")
     record_sync_period: float = fixed(
         1.0, "The most that a power cut can take from a recording [s]; 0: no promise.", within=(0.0, 3600.0)
@@ -152,10 +144,11 @@ def _names_a_folder(path: str) -> bool:
 
 def listing(kind: type) -> str:
     """The parameters, one per line."""
-    specs = specs_of(kind).items()
-    return "\n".join(
-        ["parameters:", *(f"  {name:<20}{one.description} Default: {one.default!r}" for name, one in specs)]
-    )
+    lines = ["parameters:"]
+    for name, one in specs_of(kind).items():
+        choices = f" One of {', '.join(one.choices)}." if one.choices else ""
+        lines.append(f"  {name:<20}{one.description}{choices} Default: {one.default!r}")
+    return "\n".join(lines)
 
 
 def declare(node: Any, kind: type[Settings]) -> Settings:
@@ -227,7 +220,8 @@ def _coerced(name: str, value: Any, spec: Spec) -> Any:
             items = [None]
     if not all(_is_of(kind, item) for item in items):
         hint = "an empty list" if kind is str else "whole numbers and decimals mixed; write all as decimals"
-        hint = f": no value, or {hint}" if value is None and is_list else ""  # ROS turns these into None
+        is_text = is_list and kind is not str and isinstance(value, str)  # `ros2 param set` makes this of mixed numbers
+        hint = f": no value, or {hint}" if value is None and is_list else f": {hint}" * is_text  # ROS itself makes None
         raise SettingsError(f"{name}: wanted {wanted}, got {value!r}{hint}")
     convert = expanded if spec.is_path else kind
     return tuple(map(convert, items)) if is_list else convert(value)

@@ -19,6 +19,7 @@ pytest.importorskip("launch_ros", reason="launch_ros isn't installed: it comes w
 from harness import GARMENTS, PATIENCE_S, Peer
 from launch.launch_description_sources import get_launch_description_from_python_launch_file
 from launch.utilities import perform_substitutions
+from launch_ros.actions import Node
 
 from launch import LaunchContext
 from refu_core.options import specs_of
@@ -75,6 +76,40 @@ def test_a_bad_value_is_one_line_and_nothing_is_started() -> None:
     assert "margin: wanted a value like 0.004, got 'abc'" in said
     assert "process started" not in said
     assert "Traceback" not in said
+
+
+@pytest.mark.usefixtures("prefix")
+def test_what_would_be_ignored_is_said(tmp_path: Path) -> None:
+    doubts = runpy.run_path(str(ROOT / "launch" / "garments.launch.py"))["doubts"]
+    file = tmp_path / "parameters.yaml"
+    for key, namespace, fits in (
+        ("/**", "robot", True),
+        ("/**/garment_node", "", True),
+        ("/robot/garment_node", "/robot/", True),
+        ("/*/garment_node", "robot", True),
+        ("/*/garment_node", "", False),
+        ("/garment_node", "robot", False),  # `ros2 param dump` of a node elsewhere
+    ):
+        file.write_text(f"{key}:\n  ros__parameters:\n    margin: 0.004\n")
+        said = doubts(file, namespace, {"margin", "bag", "its_includers"})
+        assert bool(said) != fits, (key, namespace)
+        assert fits or said[0].startswith(f"params_file: {file} is for {key}; ")
+    file.write_text("robot:\n  garment_node:\n    ros__parameters: {}\n")
+    assert doubts(file, "robot", {"garmets"}) == ["there is no argument garmets: is garments meant?"]
+    file.write_text("a: [1")
+    assert not doubts(file, "", set())  # the node says it
+    with pytest.raises(RuntimeError, match=r"^params_file: there is no file "):
+        doubts(tmp_path / "none.yaml", "", set())
+
+
+@pytest.mark.usefixtures("prefix")
+def test_launch_makes_no_ros_node_of_its_own() -> None:
+    """Threads of one in launch's process kept some Ctrl-C from ending it."""
+    run = runpy.run_path(str(ROOT / "launch" / "garments.launch.py"))
+    context = LaunchContext()
+    context.launch_configurations.update(dict.fromkeys([*run["DEFAULTS"], *run["OTHERS"], *run["TOPICS"]], ""))
+    context.launch_configurations["params_file"] = str(run["CONFIG"])
+    assert [type(one) for one in run["node"](context)] == [Node]
 
 
 @pytest.mark.usefixtures("prefix")

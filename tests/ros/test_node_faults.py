@@ -13,8 +13,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node isn't tested")
 
+import rclpy
 from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame
 from rcl_interfaces.msg import ParameterEvent
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Float32MultiArray
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -92,6 +95,20 @@ def test_two_publishers_and_leaps_are_reported(scene: Peer) -> None:
     finally:
         other.close()
     scene.spin_until(lambda: "publishers on" not in said(), "it is gone")
+
+
+def test_a_sender_of_another_type_is_named(scene: Peer) -> None:
+    context = rclpy.Context()  # a participant of its own: one has one type for each topic
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    other = rclpy.create_node("other", context=context)
+    other.create_publisher(Float32MultiArray, "smpl_params", 1)
+    wanted = "/smpl_params is sent as std_msgs/msg/Float32MultiArray, but input_type wants sensor_msgs/msg/JointState"
+    try:
+        scene.spin_until(lambda: wanted in scene.status("input")[1], "its type is named")
+    finally:
+        other.destroy_node()
+        context.try_shutdown()
+    scene.spin_until(lambda: wanted not in scene.status("input")[1], "it is gone")
 
 
 def _stalled(scene: Peer, folder: Path, stack: ExitStack) -> NodeProcess:

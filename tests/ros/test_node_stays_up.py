@@ -191,6 +191,7 @@ def test_what_is_asked_for_again_is_done_again(scene: tuple[Peer, NodeProcess], 
         ({"frame_id": "my frame"}, "spaces"),
         ({"max_rate": 1e-300}, "max_rate"),
         ({"betas": None}, "write all as decimals"),
+        ({"style": "[0, 0.5, 0, 0]"}, "write all as decimals"),  # as `ros2 param set` sends it
         ({"garments": None}, "wanted a list of strings, got None: no value, or an empty list"),
     ],
     ids=lambda value: str(value),
