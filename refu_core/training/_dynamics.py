@@ -29,7 +29,7 @@ class DynamicsSettings:
 
     loop: LoopSettings = field(default_factory=lambda: LoopSettings(weight_decay=0.3))
     steps: int = 3000
-    noise: float = 0.02
+    noise: float = 0.05
     """Standard deviation of the noise added to each number of the past [1, m]. Without it the training set has nobody
     who stands still but is observed with a little noise, and cloth trembles: noise of 0.1 degrees in joints and 3 mm in
     the root shakes a skirt by 2.1 mm from frame to frame (0.7 without dynamics); with 0.01 by 1.1, with 0.03 by 0.7.

@@ -360,19 +360,20 @@ def test_a_pipeline_tells_its_garments(folder: Path) -> None:
     np.testing.assert_allclose(together[1][GARMENT].local, still(standing)[GARMENT].local, atol=1e-5)
 
 
-def test_whatever_the_past_nothing_is_inside() -> None:
-    skirt, rng = GarmentPipeline.load(["skirt-female"], threads=2), np.random.default_rng(0)
-    assert skirt.heeds_past
-    checker = CollisionChecker(skirt.body.faces.numpy())
+@pytest.mark.parametrize("garment", ["skirt-female", "tshirt-male"])
+def test_whatever_the_past_nothing_is_inside(garment: str) -> None:
+    pipeline, rng = GarmentPipeline.load([garment], threads=2), np.random.default_rng(0)
+    assert pipeline.heeds_past
+    checker = CollisionChecker(pipeline.body.faces.numpy())
     n_promised = 0
     for size in (0.1, 0.5, 2.0, 100.0):
         pasts = size * rng.uniform(-1, 1, (6, len(LAGS), N_PAST))
-        for out in skirt([replace(promised(rng), past=past) for past in pasts]):
-            assert np.isfinite(out["skirt-female"].local).all()
+        for out in pipeline([replace(promised(rng), past=past) for past in pasts]):
+            assert np.isfinite(out[garment].local).all()
             if out.stats.within_promise:
                 n_promised += 1
                 checker.update(out.body)
-                assert checker.check(out["skirt-female"].local, out["skirt-female"].faces).n_inside == 0
+                assert checker.check(out[garment].local, out[garment].faces).n_inside == 0
     assert n_promised > 10
 
 
