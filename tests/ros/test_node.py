@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="rclpy isn't installed (extra ros): the node
 from harness import CHEAP, GARMENTS, NodeProcess, Peer, frame
 
 from msg_adapters import encoder_for, vertices_from_points, vertices_ros_from_smpl
-from refu_core import GarmentPipeline
+from refu_core import GarmentPipeline, PoseHistory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,12 +45,12 @@ def scene(ros: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]
 
 
 def test_garments_are_those_of_the_pipeline(scene: Peer) -> None:
-    wanted = GarmentPipeline.load(GARMENTS)
+    wanted, history = GarmentPipeline.load(GARMENTS), PoseHistory()
     for i in range(5):
         sent = frame(i, transl=(1.0, 2.0, 3.0))
         marker = scene.dress(sent, "ann")
         assert (marker.stamp_ns, marker.frame_id, marker.type) == (sent.stamp_ns, "map", 11)
-        mesh = wanted(sent)[GARMENTS[0]]
+        mesh = wanted(history(sent))[GARMENTS[0]]
         got = vertices_from_points(marker.points, mesh.faces)
         np.testing.assert_allclose(got, vertices_ros_from_smpl(mesh.vertices), atol=1e-5)
 
