@@ -54,7 +54,8 @@ class SequencePlan:
         if self.count < 1 or self.shapes < 1 or not 0 < self.seconds <= 600 or self.n_frames < 2:
             raise SimulationError(f"wanted a sequence and a shape at least, two frames to 600 s, got {asdict(self)}")
         if not (0 <= self.test_share < 1 and 0 <= self.synthetic_share <= 1 and self.spread > 0):
-            raise SimulationError(f"shares must lie in [0, 1) and the spread above 0, got {asdict(self)}")
+            wanted = "the test's share in [0, 1), the synthetic one in [0, 1], and the spread above 0"
+            raise SimulationError(f"wanted {wanted}, got {asdict(self)}")
 
     @property
     def n_frames(self) -> int:
