@@ -89,8 +89,9 @@ def doubts(file: Path, namespace: str, given: set[str]) -> list[str]:
 def node(context: LaunchContext) -> list[Node]:
     """The node with the file of parameters, overridden only by those given on the command line."""
     given = {name: LaunchConfiguration(name).perform(context) for name in (*DEFAULTS, "use_sim_time", *TOPICS)}
-    namespace, file = (LaunchConfiguration(name).perform(context) for name in ("namespace", "params_file"))
-    for text in doubts(Path(file).expanduser(), namespace, {*context.launch_configurations}):
+    namespace, params_file = (LaunchConfiguration(name).perform(context) for name in ("namespace", "params_file"))
+    file = Path(params_file).expanduser()
+    for text in doubts(file, namespace, {*context.launch_configurations}):
         get_logger("garments").warning(text)
     return [
         # Not launch's LifecycleNode: that makes a ROS node in launch's own process, and some Ctrl-C then hang or crash.
@@ -100,7 +101,7 @@ def node(context: LaunchContext) -> list[Node]:
             name="garment_node",
             namespace=namespace,
             parameters=[
-                str(Path(file).expanduser()),
+                str(file),
                 {name: parsed(name, text) for name, text in given.items() if text and name not in TOPICS},
             ],
             remappings=[(topic, given[name]) for name, topic in TOPICS.items() if given[name]],

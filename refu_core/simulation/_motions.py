@@ -12,15 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.errors import SimulationError
 from refu_core.recordings import interpolated
-from refu_core.simulation._poses import (
-    FIRST_POSTURES,
-    Clip,
-    clip_pose,
-    drawn_posture,
-    mirrored,
-    random_pose,
-    without_heading,
-)
+from refu_core.simulation._poses import Clip, drawn_pose, mirrored, without_heading
 from refu_core.simulation._store import FPS
 
 STEPS = 2
@@ -101,9 +93,13 @@ def synthetic_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Genera
     A network learns the motions of a few minutes' recordings by heart; between drawn poses there is no end of them.
     """
     n = n_steps(n_frames)
-    keys, at, heading = [_key_pose(clips, rng)], [0.0], 0.0
+
+    def drawn() -> NDArray[np.float64]:
+        return drawn_pose(clips, rng, recorded_share=_OF_CLIPS, posture_share=_OF_POSTURES)[0].astype(np.float64)
+
+    keys, at, heading = [drawn()], [0.0], 0.0
     while at[-1] * RATE < n:
-        pose = _key_pose(clips, rng)
+        pose = drawn()
         heading += _TURN * rng.standard_normal()
         pose[0] = (Rotation.from_euler("y", heading) * Rotation.from_rotvec(pose[0])).as_rotvec()
         angles = (Rotation.from_rotvec(keys[-1]).inv() * Rotation.from_rotvec(pose)).magnitude()
@@ -115,15 +111,6 @@ def synthetic_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Genera
     matrices = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(n, -1)
     poses = Rotation.from_matrix(_rounded(matrices).reshape(-1, 3, 3)).as_rotvec().reshape(poses.shape)
     return DrawnMotion(*_facing_forward(poses, np.cumsum(_rounded(velocity), axis=0) / RATE))
-
-
-def _key_pose(clips: Sequence[Clip], rng: np.random.Generator) -> NDArray[np.float64]:
-    kind = rng.random()
-    if kind < _OF_CLIPS:
-        pose = clip_pose(clips, rng)[0]
-    else:
-        pose = drawn_posture(rng, FIRST_POSTURES)[0] if kind < _OF_CLIPS + _OF_POSTURES else random_pose(rng)
-    return pose.astype(np.float64)
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from scipy.special import ndtr, ndtri
 from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, garment_name
-from refu_core.simulation._poses import FIRST_POSTURES, POSTURES, Clip, clip_pose, drawn_posture, random_pose
+from refu_core.simulation._poses import FIRST_POSTURES, POSTURES, Clip, drawn_pose
 
 TRAIN, TEST = 0, 1
 _MOST = 10**9
@@ -143,15 +143,7 @@ class SamplePlan:
         return value[:N_BETAS], value[N_BETAS:]
 
     def pose(self, slot: int, attempt: int, clips: Sequence[Clip]) -> tuple[NDArray[np.float32], int, int]:
-        """The pose that a slot tries at its `attempt`: (24, 3) [rad], the clip's number and frame.
-
-        Without a clip its number is -1 and the frame is the posture's number, or -1 for a random pose.
-        """
+        """The pose that a slot tries at its `attempt`, and its clip and frame, as `drawn_pose` tells them."""
         rng = np.random.default_rng(self._key(3, slot, attempt))
-        kind = rng.random()
-        if kind < self.recorded_share and clips:
-            return clip_pose(clips, rng)
-        if self.recorded_share <= kind < self.recorded_share + self.posture_share:
-            pose, which = drawn_posture(rng, self.postures)
-            return pose, -1, which
-        return random_pose(rng), -1, -1
+        shares = {"recorded_share": self.recorded_share, "posture_share": self.posture_share}
+        return drawn_pose(clips, rng, **shares, postures=self.postures)

@@ -217,3 +217,24 @@ def drawn_posture(rng: np.random.Generator, names: Sequence[str]) -> tuple[NDArr
     if rng.random() < 0.5:
         pose = mirrored(pose)
     return without_heading(pose), tuple(POSTURES).index(name)
+
+
+def drawn_pose(
+    clips: Sequence[Clip],
+    rng: np.random.Generator,
+    *,
+    recorded_share: float,
+    posture_share: float,
+    postures: Sequence[str] = FIRST_POSTURES,
+) -> tuple[NDArray[np.float32], int, int]:
+    """A clip's frame, one of the postures, varied, or a pose within joints' limits: (24, 3) [rad], clip and frame.
+
+    Without a clip its number is -1 and the frame is the posture's number, or -1 for a random pose.
+    """
+    kind = rng.random()
+    if kind < recorded_share and clips:
+        return clip_pose(clips, rng)
+    if recorded_share <= kind < recorded_share + posture_share:
+        pose, which = drawn_posture(rng, postures)
+        return pose, -1, which
+    return random_pose(rng), -1, -1

@@ -82,10 +82,13 @@ class SequencePlan:
 
     def motion(self, slot: int, clips: list[Clip], attempt: int = 0) -> DrawnMotion:
         """The motion that a sequence tries to show. Raises `SimulationError` when no clip is long enough."""
-        is_synthetic = np.random.default_rng(self._key(3, slot)).random() < self.synthetic_share
         rng = np.random.default_rng(self._key(2, slot, *([attempt] if attempt else [])))
-        draw = synthetic_motion if is_synthetic and self.split_of(slot) == TRAIN else recorded_motion
-        return draw(clips, self.n_frames, rng)
+        return (synthetic_motion if self.is_synthetic(slot) else recorded_motion)(clips, self.n_frames, rng)
+
+    def is_synthetic(self, slot: int) -> bool:
+        """Whether a sequence shows a synthetic motion."""
+        is_drawn = np.random.default_rng(self._key(3, slot)).random() < self.synthetic_share
+        return bool(is_drawn) and self.split_of(slot) == TRAIN
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,8 @@ class SequenceSimulator(Simulator):
     ) -> None:
         """As `Simulator`; also raises `SimulationError` when the clips of a split are too short."""
         super().__init__(plan, clips, settings, body)
-        for slot in (0, plan.count - 1):
+        recorded = [slot for slot in range(plan.count) if not plan.is_synthetic(slot)]
+        for slot in (*recorded[:1], *recorded[-1:]):
             plan.motion(slot, clips[plan.split_of(slot) == TEST])
 
     @property

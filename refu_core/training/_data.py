@@ -112,10 +112,9 @@ class TrainingSamples:
         """The samples of these indices, or of this mask."""
         return TrainingSamples(*(getattr(self, field.name)[which] for field in fields(self)))
 
-    def joined(self, other: TrainingSamples) -> TrainingSamples:
-        """These samples and those of `other`."""
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return TrainingSamples(*(torch.cat(pair) for pair in pairs))
+    def joined(self, *others: TrainingSamples) -> TrainingSamples:
+        """These samples and those of `others`."""
+        return TrainingSamples(*(torch.cat([getattr(one, f.name) for one in (self, *others)]) for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -354,6 +354,15 @@ def test_tests_and_half_of_what_is_learnt_are_recorded(clips: Path) -> None:
         assert wholly.motion(slot, split[wholly.split_of(slot)]).clip >= 0
 
 
+def test_short_motions_are_refused_at_once_whatever_the_first_and_last_show(clips: Path, tmp_path: Path) -> None:
+    plan: dict[str, Any] = {"shapes": 1, "seconds": 5.0, "test_share": 0.0, "synthetic_share": 0.5}
+    plans = {seed: SequencePlan(GARMENT, 9, seed=seed, **plan) for seed in range(30)}
+    seed = next(seed for seed, one in plans.items() if one.is_synthetic(0) and one.is_synthetic(8))
+    with pytest.raises(SimulationError, match="the longest has"):
+        simulate_sequences(GARMENT, 9, tmp_path / "set", motions=clips, seed=seed, **plan)
+    assert not (tmp_path / "set").exists()
+
+
 def test_acceleration_is_that_of_the_way() -> None:
     t = np.arange(120) / (FPS * STEPS)
     way = np.stack((2.0 * t**2, 0 * t, 0 * t), 1)
