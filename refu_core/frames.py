@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,3 +141,9 @@ class SmplFrame:
 
     def __repr__(self) -> str:
         return f"SmplFrame(transl={self.transl.tolist()}, stamp_ns={self.stamp_ns})"
+
+
+def pasts_of(frames: Sequence[SmplFrame]) -> NDArray[np.float32]:
+    """The frames' pasts, shape (B, 4, 219); people in frames without one stand still."""
+    still = np.zeros(_PAST, np.float32)
+    return np.stack([still if frame.past is None else frame.past for frame in frames])

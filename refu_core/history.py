@@ -114,7 +114,8 @@ def _past(moments: Sequence[_Moment]) -> NDArray[np.float32]:
     after = np.minimum(before + 1, len(ages) - 1)
     pairs = [(moments[a], moments[b], w) for a, b, w in zip(before, after, place - before, strict=True)]
     rotations = np.stack([(1 - w) * a.rotations + w * b.rotations for a, b, w in pairs])
-    way = np.stack([(1 - w) * a.transl + w * b.transl for a, b, w in pairs]) - now.transl
+    # Relative to where the root is now, so that far from the origin no motion is made of rounding.
+    way = np.stack([(1 - w) * (a.transl - now.transl) + w * (b.transl - now.transl) for a, b, w in pairs])
     root = now.rotations[0]
     turned = rotations - now.rotations
     turned[:, 0] = root.T @ turned[:, 0]

@@ -22,7 +22,7 @@ from refu_core.backbones import Skinned
 from refu_core.body import SmplBody
 from refu_core.contact import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import FrameError, GarmentError, RefuError, require_type
-from refu_core.frames import LAGS, MAX_COEFFICIENT, N_BETAS, N_PAST, N_STYLES, SmplFrame, checked_numbers
+from refu_core.frames import MAX_COEFFICIENT, N_BETAS, N_STYLES, SmplFrame, checked_numbers, pasts_of
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import MAX_MARGIN, BackboneName, SdfMode
 from refu_core.realtime._contact import ContactStage
@@ -269,7 +269,7 @@ class GarmentPipeline:
         margins = tuple(one.margin if margin is None else margin for one in self.outfit.wearables.values())
         told = {}
         if self.heeds_past and any(frame.past is not None for frame in frames):
-            told["past"] = _past(frames)
+            told["past"] = torch.from_numpy(pasts_of(frames))
         if any(frame.up[1] != 1 for frame in frames):
             told["up"] = torch.as_tensor(np.stack([frame.up for frame in frames]))
         if self._graphs is not None and adjust is None:
@@ -326,12 +326,6 @@ class GarmentPipeline:
         promised = within_promise(frame, style) and not shift.n_held
         took = FrameStats(stage_ms, stats, self._is_certified, promised, skipped, shift)
         return PipelineOutput(meshes, later(person.body), later(person.skin), took)
-
-
-def _past(frames: Sequence[SmplFrame]) -> Tensor:
-    """The frames' pasts, shape (B, 4, 219); rest for frames without one."""
-    rest = np.zeros((len(LAGS), N_PAST), np.float32)
-    return torch.as_tensor(np.stack([rest if frame.past is None else frame.past for frame in frames]))
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:

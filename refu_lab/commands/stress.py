@@ -14,7 +14,7 @@ from refu_core.options import SettingsError, setting
 from refu_lab.commands import _common as cli
 
 PARTS = ("numbers", "guarantees", "invariance", "soak")
-MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("tailornet", "accurate"), ("tailornet", "hybrid"))
+MODES: tuple[tuple[str, str], ...] = (("skinned", "accurate"), ("auto", "accurate"), ("auto", "hybrid"))
 """Backbone and signed distance of the modes that are tried by default."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.body import JOINT_NAMES
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
+from refu_core.history import PoseHistory
 from refu_core.realtime import PROMISED_BEND, PROMISED_POSES, PROMISED_SIZE, SPINE, spine_bend
 from refu_core.recordings import interpolated
 
@@ -156,6 +158,28 @@ FRAMES: Mapping[str, Draw] = {
     "limbs through the trunk": _self_penetrating,
     "absurd": _absurd,
 }
+
+
+def on_the_move(frame: SmplFrame, rng: np.random.Generator) -> SmplFrame:
+    """The frame of a person whose joints all turned, and who changed course, in the fifths of a second before it."""
+    moments = []
+    for ago in (400_000_000, 200_000_000):
+        pose, place = everyday_pose(rng).astype(np.float32), frame.transl + rng.normal(0, 0.3, 3)
+        pose[0] = frame.pose[0]  # whose root turns too fast is somebody else
+        moments.append(replace(frame, pose=pose, transl=place, stamp_ns=frame.stamp_ns - ago))
+    return PoseHistory.told([*moments, frame])[-1]
+
+
+MOTION_FPS = 60
+"""Frames of a motion in a second."""
+
+
+def motion(
+    poses: Sequence[NDArray[np.floating]], betas: NDArray[np.floating], style: NDArray[np.floating] | None = None
+) -> list[SmplFrame]:
+    """The frames of one person in such poses (24, 3) [rad], each with its past."""
+    stamps = (round(1e9 * i / MOTION_FPS) for i in range(len(poses)))
+    return PoseHistory.told(frame_of(one, betas, style=style, stamp_ns=t) for one, t in zip(poses, stamps, strict=True))
 
 
 def between(poses: Sequence[NDArray[np.floating]], steps: int) -> list[NDArray[np.float64]]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from refu_core.backbones import Skinned
 from refu_core.body import Surface
 from refu_core.contact import ASKED_FROM, DEFAULT_CONTACT
-from refu_core.frames import SmplFrame
+from refu_core.frames import SmplFrame, pasts_of
 from refu_core.garments import inner_first
 from refu_core.mesh import face_normals
 from refu_core.modes import DEFAULT_MARGIN
@@ -157,7 +157,7 @@ def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> d
     pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
     style = None if frame.style is None else torch.tensor(frame.style)[None]
     with torch.no_grad():
-        dressed = dress(pose, Wearer.of(outfit, betas, style))
+        dressed = dress(pose, Wearer.of(outfit, betas, style), past=torch.from_numpy(pasts_of([frame])))
         stage.update(dressed.body[0])
         ways = {}
         for name, one in dressed.drapes.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.body import MIRRORED_JOINTS
-from refu_core.frames import SmplFrame
+from refu_core.frames import N_JOINTS, SmplFrame, pasts_of
 from refu_core.realtime import GarmentMesh
-from refu_lab.stress._frames import frame_of
 from refu_lab.stress._numbers import ROUNDING
 from refu_lab.stress._trial import Measurement, Subject, Trial, distance_to_mesh
 
@@ -38,7 +38,7 @@ def turned(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     turn = Rotation.random(random_state=rng) if is_skinned else Rotation.from_euler("y", rng.uniform(-np.pi, np.pi))
     pose = np.array(frame.pose, np.float64)
     pose[0] = (turn * Rotation.from_rotvec(pose[0])).as_rotvec()
-    here, there = subject.pipeline(frame), subject.pipeline(frame_of(pose, betas=frame.betas))
+    here, there = subject.pipeline(frame), subject.pipeline(replace(frame, pose=pose.astype(np.float32)))
     root = subject.pipeline.body.rest_joints(torch.tensor(frame.betas)[None])[0, 0].double().numpy()
     for name, mesh in here.items():
         yield _apart(turn.apply(mesh.local - root) + root, there[name].local, RIGID)
@@ -48,7 +48,7 @@ def moved(subject: Subject, trial: Trial) -> Iterator[Measurement]:
     """Compares the garment of a person up to 100 km away along each axis with that of one at the origin."""
     rng, frame = np.random.default_rng(trial.seed), trial.frames[0]
     transl = _FAR * rng.uniform(-1, 1, 3)
-    here, there = subject.pipeline(frame), subject.pipeline(frame_of(frame.pose, betas=frame.betas, transl=transl))
+    here, there = subject.pipeline(frame), subject.pipeline(replace(frame, transl=transl))
     for name, mesh in here.items():
         yield _apart(mesh.vertices, there[name].vertices - transl, RIGID)
 
@@ -75,11 +75,14 @@ def mirrored(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 
 def mirror_image(frame: SmplFrame) -> SmplFrame:
     """The frame mirrored at x = 0: left and right joints exchanged, rotations mirrored."""
-    return frame_of(
-        frame.pose[MIRRORED_JOINTS,] * np.array((1, -1, -1), np.float32),
-        frame.betas,
-        frame.transl * (-1, 1, 1),
-        frame.style,
+    mirror = np.array((-1, 1, 1), np.float32)
+    rotations, way = np.split(pasts_of([frame])[0], (9 * N_JOINTS,), axis=1)
+    rotations = rotations.reshape(-1, N_JOINTS, 3, 3)[:, MIRRORED_JOINTS] * np.outer(mirror, mirror)
+    return replace(
+        frame,
+        pose=frame.pose[MIRRORED_JOINTS,] * np.array((1, -1, -1), np.float32),
+        transl=frame.transl * mirror,
+        past=np.concatenate((rotations.reshape(len(way), -1), way * mirror), 1),
     )
 
 

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from refu_core._device import one_thread
-from refu_core.errors import FrameError
+from refu_core.backbones import backbone_weights
+from refu_core.errors import FrameError, WeightsError
 from refu_core.frames import N_BETAS, N_STYLES
 from refu_core.garments import load_garment
-from refu_core.weights import weights_folder
 from refu_lab.commands.stress import StressOptions
 from refu_lab.stress import _guarantees as guarantees
 from refu_lab.stress import _invariance as invariance
 from refu_lab.stress import _numbers as numbers
-from refu_lab.stress._frames import FRAMES, Draw, between, everyday, everyday_pose, frame_of, promised
+from refu_lab.stress._frames import FRAMES, Draw, between, everyday, everyday_pose, frame_of, motion, promised
 from refu_lab.stress._soak import SoakResult, soak
 from refu_lab.stress._trial import (
     Check,
@@ -96,14 +96,14 @@ def _wide(rng: np.random.Generator) -> Trial:
 def _motion(rng: np.random.Generator) -> Trial:
     betas, style = rng.normal(0, 1, N_BETAS), rng.normal(0, 1, N_STYLES)
     poses = [0.7 * everyday_pose(rng) for _ in range(2)]
-    return Trial(tuple(frame_of(pose, betas, style=style) for pose in between(poses, _STEPS)))
+    return Trial(tuple(motion(between(poses, _STEPS), betas, style)))
 
 
 def _folding(rng: np.random.Generator) -> Trial:
     """Motion from an everyday pose to one with limbs through the trunk."""
     last = FRAMES["limbs through the trunk"](rng)
     poses: list[NDArray[np.floating]] = [0.7 * everyday_pose(rng), last.pose]
-    return Trial(tuple(frame_of(pose, last.betas) for pose in between(poses, _STEPS)))
+    return Trial(tuple(motion(between(poses, _STEPS), last.betas)))
 
 
 def _teleport(rng: np.random.Generator) -> Trial:
@@ -215,11 +215,13 @@ def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
     left_out = []
     for backbone, sdf in options.modes:
         for name in dict.fromkeys(options.garments):
-            body, weights = load_garment(name).body, weights_folder(name, options.weights)
-            if backbone == "skinned" or (weights / f"{backbone}-{sdf}.safetensors").exists():
-                worn.setdefault((backbone, sdf, body), []).append(name)
+            body, folder = load_garment(name).body, None if options.weights is None else options.weights / name
+            try:
+                backbone_weights(backbone, name, mode=sdf, folder=folder)
+            except WeightsError as error:
+                left_out.append(f"{name}: no weights of {backbone} {sdf} ({error})")
             else:
-                left_out.append(f"{name}: no weights of {backbone} {sdf}")
+                worn.setdefault((backbone, sdf, body), []).append(name)
     if not worn:
         raise StressError(f"nothing to try: {'; '.join(left_out) or 'no garment was named'}")
     found = [Wardrobe(garments=tuple(names), backbone=b, sdf=sdf) for (b, sdf, _), names in worn.items()]
@@ -245,7 +247,7 @@ def _run_checks(
             key = zlib.crc32(f"{check.name} {wardrobe.garments}".encode())
             rng = np.random.default_rng((options.seed, key, round_))
             for _ in range(check.trials):
-                trial = check.draw(rng)
+                trial = check.trial(rng)
                 tally.add(wardrobe, trial, check.run(subject, trial))
             bar.update()
     return list(tallies.values())

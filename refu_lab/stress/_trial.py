@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from refu_core._files import replacing
 from refu_core._npz import read_npz
 from refu_core.errors import RefuError
-from refu_core.frames import N_STYLES, SmplFrame
+from refu_core.frames import N_STYLES, SmplFrame, pasts_of
 from refu_core.metrics import CollisionChecker
 from refu_core.modes import SdfMode
 from refu_core.realtime import ContactStage, GarmentPipeline, Outfit, Wearer, dress
 from refu_core.sdf import ApproxSdf, BandSdf, BodySdf, ExactSdf
+from refu_lab.stress._frames import on_the_move
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +101,7 @@ def predicted(outfit: Outfit, frames: Sequence[SmplFrame]) -> list[NDArray[np.fl
     columns = zip(*((f.pose, f.betas, none if f.style is None else f.style) for f in frames), strict=True)
     pose, betas, style = (torch.as_tensor(np.stack(one)).to(outfit.body.v_template.dtype) for one in columns)
     wearer = Wearer.of(outfit, betas, style if any(frame.style is not None for frame in frames) else None)
-    dressed = dress(pose, wearer)
+    dressed = dress(pose, wearer, past=torch.as_tensor(pasts_of(frames)).to(pose.dtype))
     return [
         torch.stack([turn(one) for turn, one in zip(dressed.turns, found, strict=True)]).numpy()
         for found in (dressed.body, *(drape.vertices for drape in dressed.drapes.values()))
@@ -146,7 +147,7 @@ def _to_planes(points: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
     return torch.where(above & (area > 0), height2, torch.inf).amin(1)
 
 
-_KEYS = ("check", "garments", "backbone", "sdf", "pose", "betas", "transl", "style", "has_style", "seed")
+_KEYS = ("check", "garments", "backbone", "sdf", "pose", "betas", "transl", "past", "style", "has_style", "seed")
 
 
 class StressError(RefuError, ValueError):
@@ -208,6 +209,12 @@ class Check:
     """Frames that a trial runs in addition to those drawn."""
     needs_sdf: bool = False
     """Whether the mode `none` doesn't promise it."""
+
+    def trial(self, rng: np.random.Generator) -> Trial:
+        """A trial; people in frames that aren't of a motion were on the move, each in a way of their own."""
+        trial = self.draw(rng)
+        frames = (one if one.past is not None else on_the_move(one, rng) for one in trial.frames)
+        return replace(trial, frames=tuple(frames))
 
     @property
     def part(self) -> str:
@@ -285,7 +292,7 @@ def save_trial(path: Path, check: str, wardrobe: Wardrobe, trial: Trial) -> Path
     """Writes a trial to `path`, an npz that `load_trial` reads."""
     frames = trial.frames
     styles = [np.zeros(N_STYLES, np.float32) if frame.style is None else frame.style for frame in frames]
-    told = {"check": check, "seed": np.int64(trial.seed), "style": styles, **asdict(wardrobe)}
+    told = {"check": check, "seed": np.int64(trial.seed), "style": styles, "past": pasts_of(frames), **asdict(wardrobe)}
     told |= {name: [getattr(frame, name) for frame in frames] for name in ("pose", "betas", "transl")}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
@@ -305,8 +312,11 @@ def load_trial(path: Path) -> tuple[str, Wardrobe, Trial]:
     garments = tuple(map(str, np.atleast_1d(data["garments"])))
     wardrobe = Wardrobe(garments=garments, backbone=str(data["backbone"]), sdf=str(data["sdf"]))
     try:
-        columns = zip(*(data[key] for key in ("pose", "betas", "transl", "style", "has_style")), strict=True)
-        frames = tuple(SmplFrame(p, b, t, style=style if has_style else None) for p, b, t, style, has_style in columns)
+        columns = zip(*(data[key] for key in ("pose", "betas", "transl", "past", "style", "has_style")), strict=True)
+        frames = tuple(
+            SmplFrame(p, b, t, style=style if has_style else None, past=past)
+            for p, b, t, past, style, has_style in columns
+        )
         return str(data["check"]), wardrobe, Trial(frames, int(data["seed"]))
     except (RefuError, TypeError, ValueError) as error:
         raise StressError(f"{path}: its frames can't be used: {error}") from error

@@ -140,6 +140,12 @@ def test_who_stands_or_glides_has_no_past(seed: int) -> None:
     assert not told[0].any()  # type: ignore[union-attr]
 
 
+def test_far_away_no_motion_is_made_of_rounding() -> None:
+    far = np.array((1e28, -3e27, 0.0))
+    frames = (SmplFrame(np.zeros((24, 3)), transl=far, stamp_ns=round(1e9 * i / FPS)) for i in range(30))
+    assert not any(frame.past.any() for frame in PoseHistory.told(frames) if frame.past is not None)
+
+
 @pytest.mark.parametrize("break_", ["clock back", "long pause", "leap", "turn"])
 def test_what_does_not_go_on_starts_anew(break_: str) -> None:
     motion, history = a_motion(3), PoseHistory()

@@ -22,13 +22,13 @@ from refu_lab.stress._trial import Check, Subject, Trial, Wardrobe, distance_to_
 WORST = sorted((Path(__file__).parents[1] / "data" / "stress").glob("*.npz"))
 WARDROBES = {
     "skinned/accurate": Wardrobe(garments=("skirt-female",)),
-    "tailornet/accurate": Wardrobe(garments=("tshirt-male",), backbone="tailornet"),
-    "tailornet/hybrid": Wardrobe(garments=("tshirt-male",), backbone="tailornet", sdf="hybrid"),
+    "auto/accurate": Wardrobe(garments=("tshirt-male",), backbone="auto"),
+    "auto/hybrid": Wardrobe(garments=("tshirt-male",), backbone="auto", sdf="hybrid"),
 }
 _subjects: dict[str, Subject] = {}
 
 
-@pytest.fixture(params=["skinned/accurate", "tailornet/hybrid"])
+@pytest.fixture(params=["skinned/accurate", "auto/hybrid"])
 def subject(request: pytest.FixtureRequest) -> Subject:
     return _subject(request.param)
 
@@ -43,7 +43,7 @@ _TRIED = [
     pytest.param(check, mode, id=f"{name.replace(' ', '-')}-{mode}")
     for name, check in CHECKS.items()
     for mode, wardrobe in WARDROBES.items()
-    if check.holds_for(wardrobe) and (mode != "tailornet/accurate" or check.part == "guarantees")
+    if check.holds_for(wardrobe) and (mode != "auto/accurate" or check.part == "guarantees")
     if mode != "skinned/accurate" or check.part != "numbers"  # of a body, and of networks
     if not name.endswith("worn together")  # one garment alone: of two there are worst cases below
 ]
@@ -53,7 +53,7 @@ _TRIED = [
 def test_what_refu_stress_checks(check: Check, mode: str) -> None:
     subject = _subject(mode)
     rng = np.random.default_rng(2)
-    measured = check.run(subject, check.draw(rng))
+    measured = check.run(subject, check.trial(rng))
     # A vertex at one of collision handling's thresholds may fall on either side of it by a bit of rounding, on one
     # machine and not on another: that moves it by no more than the margin.
     is_at_threshold = check.part == "invariance" and not measured.faults and measured.deviation < DEFAULT_MARGIN

@@ -135,7 +135,7 @@ def short_motions(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def trial_of(check: Check, seed: int = 0) -> Trial:
-    return check.draw(np.random.default_rng(seed))
+    return check.trial(np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_a_saved_trial_is_the_same_trial(tmp_path: Path) -> None:
     name, wardrobe, again = load_trial(path)
     assert (name, wardrobe, again.seed, len(again.frames)) == (check.name, SHORTS, trial.seed, len(trial.frames))
     for one, two in zip(trial.frames, again.frames, strict=True):
-        for key in ("pose", "betas", "transl"):
+        for key in ("pose", "betas", "transl", "past"):
             np.testing.assert_array_equal(getattr(one, key), getattr(two, key))
         assert (one.style is None) == (two.style is None)
 
