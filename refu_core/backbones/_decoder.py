@@ -139,8 +139,9 @@ class BasisDecoder(nn.Module):
             if len(mean) != len(controls.vertices):
                 msg = f"wanted a basis at {len(controls.vertices)} controls, got one at {len(mean)}: get them again"
                 raise WeightsError(msg)
-            self._at_controls = {"mean": mean.half(), "components": components.half()}
-            both = torch.cat((mean.flatten()[None], components)).half().float()
+            stored = _Stored.of(components.float())
+            self._at_controls = {"mean": mean.half(), **stored.tensors()}
+            both = torch.cat((mean.half().float().flatten()[None], stored.components()))
             mean, components = controls(both.view(len(both), -1, 3)).flatten(1).tensor_split((1,))
             mean = mean.view(-1, 3)
         self.n_vertices = len(mean)
@@ -161,14 +162,14 @@ class BasisDecoder(nn.Module):
         """
         if missing := [name for name in ("mean", "components") if name not in tensors]:
             raise WeightsError(f"has no {' and no '.join(missing)}: not an output basis")
-        coarse = tensors["components"].float()
+        coarse, controls = tensors["components"].float(), None
+        nothing = torch.zeros(0, *coarse.shape[1:], dtype=torch.int8)
+        stored = _Stored(coarse, tensors.get("fine", nothing), tensors.get("steps", coarse.new_zeros(0)).float())
         if "controls" in tensors:
             if garment is None:
                 raise WeightsError("is known at controls alone: say whose basis it is")
-            return cls(tensors["mean"].float(), coarse, controls=Controls.of(garment, tensors["controls"]))
-        nothing = torch.zeros(0, *coarse.shape[1:], dtype=torch.int8)
-        stored = _Stored(coarse, tensors.get("fine", nothing), tensors.get("steps", coarse.new_zeros(0)).float())
-        return cls(tensors["mean"].float(), stored.components())
+            controls = Controls.of(garment, tensors["controls"])
+        return cls(tensors["mean"].float(), stored.components(), controls=controls)
 
     def forward(self, code: Tensor) -> Tensor:
         """Displacements [m], shape (B, V, 3), of codes (B, R)."""
@@ -203,9 +204,7 @@ class BasisDecoder(nn.Module):
         """What a basis file holds."""
         if self.controls is not None and self._at_controls is not None:
             return self._at_controls | {"controls": self.controls.vertices}
-        stored = _Stored.of(self.components)
-        tensors = {"mean": self.mean.view(-1, 3).half(), "components": stored.coarse.half()}
-        return tensors | ({"fine": stored.fine, "steps": stored.steps.bfloat16()} if len(stored.fine) else {})
+        return {"mean": self.mean.view(-1, 3).half(), **_Stored.of(self.components).tensors()}
 
 
 class _Stored(NamedTuple):
@@ -232,6 +231,11 @@ class _Stored(NamedTuple):
             msg = f"wanted a basis of (K, 3 V), bytes (R - K, 3 V) and steps (R - K), got {shapes}: get them again"
             raise WeightsError(msg)
         return torch.cat((self.coarse, self.steps[:, None] * self.fine))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What a file holds of it."""
+        fine = {"fine": self.fine, "steps": self.steps.bfloat16()} if len(self.fine) else {}
+        return {"components": self.coarse.half(), **fine}
 
 
 class _Strips:
