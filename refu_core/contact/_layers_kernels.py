@@ -132,28 +132,32 @@ def nearest_vertex(p: wp.vec3, start: int, below: Below) -> int:
 
 
 @wp.func
-def nearest_face(p: wp.vec3, start: int, below: Below) -> int:
-    """The face closest to p downhill from the fan of vertex `start`."""
+def nearest_face(p: wp.vec3, start: int, below: Below) -> tuple[int, wp.vec3, int, wp.vec3]:
+    """The face closest to p downhill from the fan of vertex `start`, and what `closest_on_face` says of it."""
     v = int(start)
     squared = float(wp.inf)
     face = int(-1)
     w = wp.vec3(1.0, 0.0, 0.0)
+    feature = int(0)
+    offset = wp.vec3()
     for _step in range(MOST_STEPS):
         last = face
         for k in range(below.cut.fan_start[v], below.cut.fan_start[v + 1]):
             f = below.cut.fan_face[k]
-            f_w, _feature, f_offset = closest_on_face(p, f, below.points, below.cut.faces)
+            f_w, f_feature, f_offset = closest_on_face(p, f, below.points, below.cut.faces)
             other = wp.length_sq(f_offset)
             if other < squared:
                 squared = other
                 face = f
                 w = f_w
+                feature = f_feature
+                offset = f_offset
         # The closest vertex isn't always a corner of the closest face: go on at the corner of largest weight.
         corner = heaviest(w)
         if face == last or below.cut.faces[face, corner] == v:
             break
         v = below.cut.faces[face, corner]
-    return face
+    return face, w, feature, offset
 
 
 @wp.func
@@ -212,21 +216,10 @@ def normal_on(face: int, w: wp.vec3, below: Below) -> wp.vec3:
 
 
 @wp.func
-def closest_of_all(p: wp.vec3, reach: float, below: Below) -> int:
-    """The closest face of the whole sheet, -1 where none is within reach."""
-    hit = wp.mesh_query_point_no_sign(below.tree, p, reach)
-    face = int(-1)
-    if hit.result:
-        face = hit.face
-    return face
-
-
-@wp.func
-def lift_off(i: int, face: int, below: Below, above: Above, rules: LayerRules) -> None:
-    """Stores the displacement that brings vertex i to the gap above its closest face of the sheet, if there is one."""
-    if face < 0:
-        return
-    w, feature, offset = closest_on_face(above.points[i], face, below.points, below.cut.faces)
+def lift_off(
+    i: int, face: int, w: wp.vec3, feature: int, offset: wp.vec3, below: Below, above: Above, rules: LayerRules
+) -> None:
+    """Stores the displacement that brings vertex i to the gap above its closest place on the sheet."""
     normal = normal_on(face, w, below)
     height = wp.dot(offset, normal)
     far = wp.length(offset)
@@ -245,6 +238,15 @@ def lift_off(i: int, face: int, below: Below, above: Above, rules: LayerRules) -
         wp.atomic_add(above.count, 0, 1)
 
 
+@wp.func
+def lift_off_all(i: int, below: Below, above: Above, rules: LayerRules) -> None:
+    """`lift_off` the closest face of the whole sheet, if one is within reach."""
+    hit = wp.mesh_query_point_no_sign(below.tree, above.points[i], rules.reach)
+    if hit.result:
+        w, feature, offset = closest_on_face(above.points[i], hit.face, below.points, below.cut.faces)
+        lift_off(i, hit.face, w, feature, offset, below, above, rules)
+
+
 @wp.kernel
 def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> None:
     """Stores what brings each vertex that is looked at to the gap above the sheet, and counts those below the gap.
@@ -261,7 +263,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
         v = int(above.found[i])
         if v == STRANGER:
             if is_within(p, below.extent, rules.gap):
-                lift_off(i, closest_of_all(p, rules.reach, below), below, above, rules)
+                lift_off_all(i, below, above, rules)
             continue
         squared = wp.length_sq(below.points[v] - p)
         # A vertex this near is in the right fold.
@@ -277,12 +279,12 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
                 v = nearest_vertex(p, v, below)
         # No point of a face is farther from its closest corner than the middle of an equilateral one: 0.578 of an edge.
         if wp.length(below.points[v] - p) <= rules.reach + 0.578 * rules.longest:
-            face = nearest_face(p, v, below)
-            w, _feature, offset = closest_on_face(p, face, below.points, below.cut.faces)
-            is_low = wp.dot(offset, normal_on(face, w, below)) < rules.gap
-            if is_low and wp.length(offset) > 0.5 * rules.reach:  # this may be another fold
-                face = closest_of_all(p, rules.reach, below)
-            lift_off(i, face, below, above, rules)
+            face, w, feature, offset = nearest_face(p, v, below)
+            if wp.dot(offset, normal_on(face, w, below)) < rules.gap:
+                if wp.length(offset) > 0.5 * rules.reach:  # this may be another fold
+                    lift_off_all(i, below, above, rules)
+                else:
+                    lift_off(i, face, w, feature, offset, below, above, rules)
 
 
 @wp.func
