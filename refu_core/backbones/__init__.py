@@ -36,6 +36,7 @@ from refu_core.backbones._presets import require_basis as require_basis
 from refu_core.backbones._presets import save_backbone as save_backbone
 from refu_core.backbones._presets import save_basis as save_basis
 from refu_core.backbones._presets import save_beyond as save_beyond
+from refu_core.backbones._presets import save_carried_dynamics as save_carried_dynamics
 from refu_core.backbones._presets import save_dynamics as save_dynamics
 from refu_core.backbones._presets import uses_basis as uses_basis
 from refu_core.backbones._presets import with_beyond as with_beyond

@@ -39,7 +39,8 @@ class Dynamics(nn.Module):
         of_joints = np.arange(9 * N_JOINTS).reshape(N_JOINTS, 9)[list(joints)].ravel()
         columns = np.concatenate((of_joints, np.arange(9 * N_JOINTS, N_PAST)))
         self.register_buffer("_columns", torch.from_numpy(columns), persistent=False)
-        self.register_buffer("_now", still.features.columns_of(config.joints), persistent=False)
+        known = tuple(j for j in config.joints if j in still.features.joints)  # all, unless they were carried over
+        self.register_buffer("_now", still.features.columns_of(known), persistent=False)
         self._columns: Tensor
         self._now: Tensor
         groups = still.features.groups

@@ -25,7 +25,16 @@ from refu_core.errors import WeightsError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.modes import BackboneName, SdfMode
-from refu_core.weights import Weights, build_for, config_of_card, load_weights, naming, save_weights, weights_folder
+from refu_core.weights import (
+    Weights,
+    build_for,
+    config_of_card,
+    load_card,
+    load_weights,
+    naming,
+    save_weights,
+    weights_folder,
+)
 
 PRESETS: tuple[str, ...] = ("realtime", "paper")
 """`realtime` has low-rank heads and sizes for a CPU, `paper` the sizes of the paper."""
@@ -167,6 +176,19 @@ def save_dynamics(folder: Path, dynamics: Dynamics, card: Mapping[str, Any]) -> 
     return _save_addition(folder / "dynamics", dynamics, card, {})
 
 
+def save_carried_dynamics(folder: Path, like: str, codes: Tensor, card: Mapping[str, Any]) -> Path | None:
+    """Writes `folder`/dynamics: those of the garment `like`, as they ship, with codes turned by `codes` (C, C').
+
+    None if `like` has none of its own. Raises `WeightsError` also if there is no basis in the folder.
+    """
+    stem = weights_folder(like) / "dynamics"
+    related = load_card(stem) if Path(f"{stem}.json").exists() else {"like": None}
+    if "like" in related:
+        return None
+    described = {"config": related.get("config"), "like": like, "like_sha256": related.get("sha256")}
+    return _save_beside(folder / "dynamics", {**described, **card}, {_CODES: codes}, [_CODES])
+
+
 def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     """The backbone `name`: the `network` made from `weights`, with the dynamics beside them if it wants those.
 
@@ -179,16 +201,43 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
     if not isinstance(network, TailorNet):
         raise WeightsError(f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}")
     stored, config = _load_addition(weights, "dynamics", DynamicsConfig)
-    if not set(config.joints) <= {0, *network.config.joints}:
+    is_carried, known = "like" in stored.card, {0, *network.config.joints}
+    if not set(config.joints) <= (set(range(N_JOINTS)) if is_carried else known):
         msg = f"{stored.path}: wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got "
         msg += f"{config.joints}; train it again"
         raise WeightsError(msg)
     with naming(f"{stored.path}: doesn't fit {weights.path.name}"):
-        dynamics = build_for(stored.tensors, lambda: Dynamics(config, network))
+        tensors = _carried(stored, config, network) if is_carried else stored.tensors
+        dynamics = build_for(tensors, lambda: Dynamics(config, network))
     dynamics = dynamics.to(next(network.parameters()).device)
     return Dynamic(network, dynamics).eval().requires_grad_(False)
 
 
+def _carried(stored: Weights, config: DynamicsConfig, network: TailorNet) -> Mapping[str, Tensor]:
+    """The tensors of dynamics that are a related garment's: their last layer gives the code of the `network`.
+
+    Of joints that it isn't told of, they hear how these have moved, but not where they are: the mean stands for that.
+    """
+    like, codes = stored.card["like"], stored.tensors.get(_CODES, torch.zeros(0))
+    if not isinstance(like, str) or like != Path(like).name:
+        raise WeightsError(f"wanted the name of a related garment, got {str(like)[:80]!r}; carry them over anew")
+    related = load_weights(weights_folder(like) / "dynamics")
+    first, last = "net.layers.0.weight", f"net.layers.{len(config.hidden)}."
+    sizes = {len(tensor) for name, tensor in related.tensors.items() if name.startswith(last)}
+    is_whole = "like" not in related.card and related.card["sha256"] == stored.card.get("like_sha256")
+    if not is_whole or codes.ndim != 2 or {codes.shape[1]} != sizes:
+        raise WeightsError(f"made from other dynamics of {like} than those that ship; carry them over anew")
+    is_known = torch.ones(related.tensors[first].shape[1], dtype=torch.bool)
+    for k, joint in enumerate(joint for joint in config.joints if joint != 0):
+        is_known[3 + 9 * k : 12 + 9 * k] = joint in network.features.joints
+    tensors = {}
+    for name, tensor in related.tensors.items():
+        heard = tensor[..., is_known] if name == first or tensor.shape == is_known.shape else tensor
+        tensors[name] = codes @ heard.float() if name.startswith(last) else heard
+    return tensors
+
+
+_CODES = "codes"
 _BASIS = "basis."
 _Config = TypeVar("_Config", DynamicsConfig, BeyondConfig)
 
@@ -202,11 +251,14 @@ def save_beyond(folder: Path, beyond: Beyond, card: Mapping[str, Any]) -> Path:
 def _save_addition(
     stem: Path, network: Dynamics | Beyond, card: Mapping[str, Any], others: Mapping[str, Tensor]
 ) -> Path:
+    tensors, in_bytes = _own_tensors(network)
+    return _save_beside(stem, {"config": asdict(network.config), **card}, {**tensors, **others}, in_bytes)
+
+
+def _save_beside(stem: Path, card: Mapping[str, Any], tensors: Mapping[str, Tensor], in_bytes: Sequence[str]) -> Path:
     """Writes what is added to a backbone, beside it; its card names the backbone's basis."""
     basis = load_weights(stem.parent / "basis", expect={"garment": card["garment"]})
-    described = {"config": asdict(network.config), "basis_sha256": str(basis.card["sha256"])}
-    tensors, in_bytes = _own_tensors(network)
-    return save_weights(stem, {**tensors, **others}, {**described, **card}, in_bytes=in_bytes)
+    return save_weights(stem, tensors, {"basis_sha256": str(basis.card["sha256"]), **card}, in_bytes=in_bytes)
 
 
 def _load_addition(weights: Weights, name: str, kind: type[_Config]) -> tuple[Weights, _Config]:

@@ -27,7 +27,7 @@ from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
 from refu_core.training._pretrain import code_loss
-from refu_core.weights import load_weights, save_weights
+from refu_core.weights import load_weights, save_weights, weights_folder
 
 _DOUBT = 0.1
 """Damps what is carried over where it varies by less than about this share of its mean variation."""
@@ -95,10 +95,11 @@ class Carried:
         ends = _from_rim(worn, place)
         goes_on = _smooth((_from_rim(garment, vertices) - ends) / settings.hem)
         share *= 1 - goes_on * _smooth(1 - ends / settings.hem)
-        self._mixed = data.SurfaceMixture(nearest.corners, nearest.weights * torch.as_tensor(share)[:, None])
+        self.mixed = data.SurfaceMixture(nearest.corners, nearest.weights * torch.as_tensor(share)[:, None])
+        """Carries displacements over, before they are posed."""
         self._garment, self._body = garment, body
         kept = torch.as_tensor(1 - share, dtype=torch.float32)[:, None]
-        self._posed_as = replace(garment, weights=self._mixed(worn.weights[None])[0] + kept * garment.weights)
+        self._posed_as = replace(garment, weights=self.mixed(worn.weights[None])[0] + kept * garment.weights)
 
     @torch.no_grad()
     def __call__(self, betas: Tensor, pose: Tensor) -> Tensor:
@@ -109,7 +110,7 @@ class Carried:
             there = self.network(known, pose, None)
             assert there is not None  # a network was asked for
             rest, transforms = self._garment.rest(betas), self._body(pose, betas).transforms
-            posed = self._posed_as.pose(rest + self._mixed(there), transforms)
+            posed = self._posed_as.pose(rest + self.mixed(there), transforms)
             return self._garment.unpose(posed, transforms) - rest
 
         return data.in_chunks(one, betas, pose, size=32)
@@ -203,7 +204,20 @@ def carry_over(
         if mode is not BASE:
             own = {key: stored[key] for key in ("config", "basis_sha256")}
             save_weights(output / f"tailornet-{mode}", {}, {**card, **own, "mode": str(mode)}, base=base)
+    codes = _own_codes(carried, share, like, basis)
+    nets.save_carried_dynamics(output, like, codes, {**described, "mode": str(BASE)})
     return {**card, "mode": str(BASE)}
+
+
+def _own_codes(carried: Carried, share: Tensor, like: str, decoder: nets.BasisDecoder) -> Tensor:
+    """What turns codes of the garment `like`, (C',), into codes (C,), shape (C, C'), for cloth that moves from rest.
+
+    `share` (V, 1) of each is carried over. Skinning weights are left out: moving cloth is centimetres from where it
+    rests, which itself has been posed with those of the related garment.
+    """
+    related, _ = nets.load_basis(weights_folder(like), load_garment(like), expect={"garment": like})
+    components = related.components.view(related.size, -1, 3)
+    return decoder.components @ (share * carried.mixed(components)).flatten(1).T
 
 
 def _borne_out(carried: Tensor, truth: Tensor, controls: nets.Controls) -> Tensor:

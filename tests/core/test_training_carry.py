@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +14,16 @@ from small_set import write_set
 from torch import Tensor
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
-from refu_core.backbones import Controls, PoseFeatures, load_backbone
+from refu_core.backbones import Controls, PoseFeatures, load_backbone, load_basis, style_shape
 from refu_core.errors import WeightsError
+from refu_core.frames import LAGS, N_PAST
 from refu_core.garments import BUILTIN_GARMENTS, save_garment
 from refu_core.modes import SdfMode
 from refu_core.simulation import open_dataset
 from refu_core.training import CarrySettings, carry_over
-from refu_core.training._carry import Carried, _borne_out, _Remainder
+from refu_core.training._carry import Carried, _borne_out, _own_codes, _Remainder
 from refu_core.training._data import displacements, posed_errors, read_samples
-from refu_core.weights import load_card, weights_folder
+from refu_core.weights import load_card, load_weights, weights_folder
 
 pytestmark = pytest.mark.usefixtures("no_curves_in_module")
 GARMENT, LIKE = "tshirt-neutral", "tshirt-male"
@@ -152,6 +155,54 @@ def test_every_mode_loads(made: Path) -> None:
         out = GarmentPipeline.load([GARMENT], sdf=mode, backbone="tailornet", weights=made)(SmplFrame(pose=ARMS_DOWN))
         assert np.isfinite(out[GARMENT].local).all()
         assert out.stats.garments[GARMENT].n_unresolved == 0 or mode is SdfMode.NONE
+
+
+def test_codes_are_turned_into_those_of_the_displacement_carried_over() -> None:
+    garment, share = load_garment(GARMENT), torch.rand(load_garment(GARMENT).n_vertices, 1)
+    over, related = carried(LIKE, GARMENT), load_basis(weights_folder(LIKE), load_garment(LIKE), expect={})[0]
+    own, _ = load_basis(weights_folder(GARMENT), garment, expect={})
+    code = torch.randn(3, related.size, generator=torch.Generator().manual_seed(0))
+    wanted = own.encode(own.mean.view(-1, 3) + share * over.mixed(related(code) - related.mean.view(-1, 3)))
+    assert torch.allclose(code @ _own_codes(over, share, LIKE, own).T, wanted, atol=1e-4)
+
+
+def test_what_motion_does_is_carried_over_too(made: Path) -> None:
+    related, own = (load_backbone("dynamic", LIKE), load_backbone("dynamic", GARMENT, folder=made / GARMENT))
+    draw = torch.Generator().manual_seed(0)
+    betas, pose, past = (torch.randn(4, *shape, generator=draw) for shape in ((10,), (24, 3), (len(LAGS), N_PAST)))
+    there, here = (one(betas, pose, None, past=past) - one(betas, pose, None) for one in (related, own))
+    codes = load_weights(made / GARMENT / "dynamics").tensors["codes"]
+    basis, _ = load_basis(weights_folder(LIKE), load_garment(LIKE), expect={})
+    wanted = there.flatten(1) @ basis.components.T @ codes.T @ own.decoder.components  # type: ignore[attr-defined]
+    assert torch.allclose(here.flatten(1), wanted, atol=2e-5)
+    assert float(there.norm()) > 0.1
+
+
+def test_where_joints_are_that_a_network_is_not_told_of_the_mean_stands_for() -> None:
+    """A dress's network doesn't know where the knees are; a skirt's dynamics do."""
+    related, own = (load_backbone("dynamic", name) for name in ("skirt-female", "dress-female"))
+    related = getattr(related, "known", related)
+    draw = torch.Generator().manual_seed(0)
+    betas, pose, past = (torch.randn(4, *shape, generator=draw) for shape in ((10,), (24, 3), (len(LAGS), N_PAST)))
+    x, s = related.still.features(pose), style_shape(betas, None)
+    knees = related.still.features.columns_of((4, 5))[3:]
+    x[:, knees] = related.dynamics.net.shift[torch.isin(related.dynamics._now, knees).nonzero()[:, 0]]
+    wanted = related.dynamics(x, s, past) @ load_weights(weights_folder("dress-female") / "dynamics").tensors["codes"].T
+    assert torch.allclose(own.dynamics(own.still.features(pose), s, past), wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "change", [{"like": "../tshirt-male"}, {"like": 3}, {"like": "tshirt-female"}, {"like_sha256": "0"}, {"config": {}}]
+)
+def test_dynamics_of_another_garment_than_they_were_carried_over_from_are_refused(
+    change: dict[str, object], made: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(made / GARMENT, tmp_path / GARMENT)
+    load_backbone("dynamic", GARMENT, folder=folder)
+    card = json.loads((folder / "dynamics.json").read_text())
+    (folder / "dynamics.json").write_text(json.dumps(card | change))
+    with pytest.raises(WeightsError, match=r"dynamics\.\w+: |no such weights"):
+        load_backbone("dynamic", GARMENT, folder=folder)
 
 
 def test_bad_asks_are_refused(data: Path, tmp_path: Path) -> None:
