@@ -60,8 +60,9 @@ def _train(
     motions = options.motions and load_clips(options.motions, axes=options.input_axes, fps=options.fps)
     rehearsal = None if options.rehearse is None else training.Rehearsal(options.rehearse, motions)
     if options.network == "dynamics":
+        common |= {"mode": options.mode, "like": options.like}
         moving = _seeded(training.DynamicsSettings(), options, **steps)
-        return training.train_dynamics(template, datasets, options.folder, mode=options.mode, settings=moving, **common)
+        return training.train_dynamics(template, datasets, options.folder, settings=moving, **common)
     if options.network in KINDS:
         assert rehearsal is not None  # `_check` has seen to it
         beyond = _seeded(training.BeyondSettings(), options, **steps)
@@ -101,8 +102,8 @@ def _check(options: TrainOptions) -> None:
         "several sets of --data are for --network dynamics: give one": (
             len(options.data) > 1 and options.network != "dynamics"
         ),
-        "--like makes a tailornet of the preset realtime: leave --network, --backbone and --preset out": (
-            options.like is not None and not is_plain
+        "--like makes a tailornet of the preset realtime, or dynamics: leave --backbone, --preset and others out": (
+            options.like is not None and options.network != "dynamics" and not is_plain
         ),
         "--like trains networks of its own: leave --start out": options.like is not None and options.start is not None,
         "--start goes on with networks as they are: leave --scale, --margin, --unblended, --network and --preset out": (

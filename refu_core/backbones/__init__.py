@@ -30,6 +30,7 @@ from refu_core.backbones._presets import backbone_config as backbone_config
 from refu_core.backbones._presets import backbone_from_weights as backbone_from_weights
 from refu_core.backbones._presets import backbone_weights as backbone_weights
 from refu_core.backbones._presets import build_backbone as build_backbone
+from refu_core.backbones._presets import carried_dynamics as carried_dynamics
 from refu_core.backbones._presets import load_backbone as load_backbone
 from refu_core.backbones._presets import load_basis as load_basis
 from refu_core.backbones._presets import require_basis as require_basis

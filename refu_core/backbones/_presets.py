@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -185,7 +185,7 @@ def save_carried_dynamics(folder: Path, like: str, codes: Tensor, card: Mapping[
     related = load_card(stem) if Path(f"{stem}.json").exists() else {"like": None}
     if "like" in related:
         return None
-    described = {"config": related.get("config"), "like": like, "like_sha256": related.get("sha256")}
+    described = {"like": like, "like_sha256": related.get("sha256")}
     return _save_beside(folder / "dynamics", {**described, **card}, {_CODES: codes}, [_CODES])
 
 
@@ -200,33 +200,42 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
         return network
     if not isinstance(network, TailorNet):
         raise WeightsError(f"{weights.path}: dynamics go with a tailornet, got {weights.card.get('backbone')}")
-    stored, config = _load_addition(weights, "dynamics", DynamicsConfig)
-    is_carried, known = "like" in stored.card, {0, *network.config.joints}
-    if not set(config.joints) <= (set(range(N_JOINTS)) if is_carried else known):
-        msg = f"{stored.path}: wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got "
-        msg += f"{config.joints}; train it again"
-        raise WeightsError(msg)
-    with naming(f"{stored.path}: doesn't fit {weights.path.name}"):
-        tensors = _carried(stored, config, network) if is_carried else stored.tensors
-        dynamics = build_for(tensors, lambda: Dynamics(config, network))
+    stored = _load_beside(weights, "dynamics")
+    with naming(stored.path):
+        dynamics = _carried(stored, network) if "like" in stored.card else _own(stored, network, weights.path.name)
     dynamics = dynamics.to(next(network.parameters()).device)
     return Dynamic(network, dynamics).eval().requires_grad_(False)
 
 
-def _carried(stored: Weights, config: DynamicsConfig, network: TailorNet) -> Mapping[str, Tensor]:
-    """The tensors of dynamics that are a related garment's: their last layer gives the code of the `network`.
+def _own(stored: Weights, network: TailorNet, of: str) -> Dynamics:
+    config = config_of_card(DynamicsConfig, stored.card.get("config"))
+    if not set(config.joints) <= {0, *network.config.joints}:
+        msg = f"wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got {config.joints}"
+        raise WeightsError(f"{msg}; train it again")
+    with naming(f"doesn't fit {of}"):
+        return build_for(stored.tensors, lambda: Dynamics(config, network))
 
-    Of joints that it isn't told of, they hear how these have moved, but not where they are: the mean stands for that.
-    """
-    like, codes = stored.card["like"], stored.tensors.get(_CODES, torch.zeros(0))
+
+def _carried(stored: Weights, network: TailorNet) -> Dynamics:
+    like = stored.card["like"]
     if not isinstance(like, str) or like != Path(like).name:
         raise WeightsError(f"wanted the name of a related garment, got {str(like)[:80]!r}; carry them over anew")
-    related = load_weights(weights_folder(like) / "dynamics")
-    first, last = "net.layers.0.weight", f"net.layers.{len(config.hidden)}."
-    sizes = {len(tensor) for name, tensor in related.tensors.items() if name.startswith(last)}
-    is_whole = "like" not in related.card and related.card["sha256"] == stored.card.get("like_sha256")
-    if not is_whole or codes.ndim != 2 or {codes.shape[1]} != sizes:
+    if load_card(weights_folder(like) / "dynamics").get("sha256") != stored.card.get("like_sha256"):
         raise WeightsError(f"made from other dynamics of {like} than those that ship; carry them over anew")
+    return carried_dynamics(like, stored.tensors.get(_CODES, torch.zeros(0)), network)
+
+
+def carried_dynamics(like: str, codes: Tensor, network: TailorNet) -> Dynamics:
+    """The dynamics that ship for the garment `like`, with codes (C',) turned into the network's by `codes` (C, C').
+
+    Of joints that the network isn't told of, they hear how these have moved, but not where they are: the mean stands
+    for that. Raises `WeightsError`: none ship that are the garment's own, or their codes have another size.
+    """
+    related = load_weights(weights_folder(like) / "dynamics")
+    config = config_of_card(DynamicsConfig, related.card.get("config"))
+    first, last = "net.layers.0.weight", f"net.layers.{len(config.hidden)}."
+    if codes.ndim != 2 or {codes.shape[1]} != {len(v) for name, v in related.tensors.items() if name.startswith(last)}:
+        raise WeightsError(f"wanted a matrix for codes of {like}, got {tuple(codes.shape)}; carry them over anew")
     is_known = torch.ones(related.tensors[first].shape[1], dtype=torch.bool)
     for k, joint in enumerate(joint for joint in config.joints if joint != 0):
         is_known[3 + 9 * k : 12 + 9 * k] = joint in network.features.joints
@@ -234,12 +243,11 @@ def _carried(stored: Weights, config: DynamicsConfig, network: TailorNet) -> Map
     for name, tensor in related.tensors.items():
         heard = tensor[..., is_known] if name == first or tensor.shape == is_known.shape else tensor
         tensors[name] = codes @ heard.float() if name.startswith(last) else heard
-    return tensors
+    return build_for(tensors, lambda: Dynamics(config, network))
 
 
 _CODES = "codes"
 _BASIS = "basis."
-_Config = TypeVar("_Config", DynamicsConfig, BeyondConfig)
 
 
 def save_beyond(folder: Path, beyond: Beyond, card: Mapping[str, Any]) -> Path:
@@ -261,12 +269,10 @@ def _save_beside(stem: Path, card: Mapping[str, Any], tensors: Mapping[str, Tens
     return save_weights(stem, tensors, {"basis_sha256": str(basis.card["sha256"]), **card}, in_bytes=in_bytes)
 
 
-def _load_addition(weights: Weights, name: str, kind: type[_Config]) -> tuple[Weights, _Config]:
-    """What `_save_addition` wrote as `name` beside a tailornet's `weights`, and its configuration."""
+def _load_beside(weights: Weights, name: str) -> Weights:
+    """What `_save_beside` wrote as `name` beside a tailornet's `weights`."""
     expect = {key: weights.card.get(key) for key in ("garment", "body_fingerprint", "basis_sha256")}
-    stored = load_weights(weights.path.with_name(name), expect=expect)
-    with naming(stored.path):
-        return stored, config_of_card(kind, stored.card.get("config"))
+    return load_weights(weights.path.with_name(name), expect=expect)
 
 
 def _own_tensors(network: Module, *, exact: bool = False) -> tuple[dict[str, Tensor], list[str]]:
@@ -299,9 +305,10 @@ def with_beyond(network: Backbone, weights: Weights) -> Backbone:
 
 
 def _load_beyond(kind: str, weights: Weights, n_vertices: int) -> Beyond:
-    stored, config = _load_addition(weights, kind, BeyondConfig)
+    stored = _load_beside(weights, kind)
     tensors = {k: v for k, v in stored.tensors.items() if not k.startswith(_BASIS)}
     with naming(stored.path):
+        config = config_of_card(BeyondConfig, stored.card.get("config"))
         decoder = BasisDecoder.of_tensors({k[len(_BASIS) :]: v for k, v in stored.tensors.items() if k not in tensors})
         if decoder.n_vertices != n_vertices:
             raise WeightsError(f"wanted {n_vertices} vertices, got {decoder.n_vertices}; train it again")

@@ -153,7 +153,7 @@ def carry_over(
     samples = data.with_mirrored(opened.samples, data.Mirror.of(template))
     controls = nets.Controls.spread(template, settings.controls)
     here = carried(samples.betas, samples.pose)
-    share = _borne_out(here, samples.displacement, controls)[:, None]
+    share = borne_out(here, samples.displacement, controls)[:, None]
     drawn = _bodies(opened.samples, settings)
     # As many of each: the folds of the samples need components of their own.
     there = share * carried(*(values[: len(samples)] for values in drawn))
@@ -204,12 +204,12 @@ def carry_over(
         if mode is not BASE:
             own = {key: stored[key] for key in ("config", "basis_sha256")}
             save_weights(output / f"tailornet-{mode}", {}, {**card, **own, "mode": str(mode)}, base=base)
-    codes = _own_codes(carried, share, like, basis)
+    codes = own_codes(carried, share, like, basis)
     nets.save_carried_dynamics(output, like, codes, {**described, "mode": str(BASE)})
     return {**card, "mode": str(BASE)}
 
 
-def _own_codes(carried: Carried, share: Tensor, like: str, decoder: nets.BasisDecoder) -> Tensor:
+def own_codes(carried: Carried, share: Tensor, like: str, decoder: nets.BasisDecoder) -> Tensor:
     """What turns codes of the garment `like`, (C',), into codes (C,), shape (C, C'), for cloth that moves from rest.
 
     `share` (V, 1) of each is carried over. Skinning weights are left out: moving cloth is centimetres from where it
@@ -220,7 +220,7 @@ def _own_codes(carried: Carried, share: Tensor, like: str, decoder: nets.BasisDe
     return decoder.components @ (share * carried.mixed(components)).flatten(1).T
 
 
-def _borne_out(carried: Tensor, truth: Tensor, controls: nets.Controls) -> Tensor:
+def borne_out(carried: Tensor, truth: Tensor, controls: nets.Controls) -> Tensor:
     """How much of what is carried over (N, V, 3) varies as the truth does, from 0 to 1, smoothly over the cloth, (V,).
 
     A sleeve moves as the related garment's does; a hem that is cut wider may not. It is found by least squares in each

@@ -54,7 +54,8 @@ class TrainOptions:
     body: str | None = cli.worn_by()
     like: str | None = setting(
         None,
-        "carry the shipped networks of this related garment over: for sets of a hundred samples; writes all modes",
+        "carry the shipped networks of this related garment over: for sets of a hundred samples; writes all modes. "
+        "With --network dynamics: learning starts from that garment's",
         metavar="GARMENT",
     )
     start: Path | None = setting(

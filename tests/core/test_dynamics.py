@@ -38,11 +38,12 @@ from refu_core.simulation import open_dataset
 from refu_core.training import DynamicsSettings, LoopSettings, train_dynamics
 from refu_core.training._data import output_basis, read_samples
 from refu_core.training._pretrain import tell_of
-from refu_core.weights import load_weights
+from refu_core.weights import load_weights, weights_folder
 from refu_lab.stress._frames import promised
 
 pytestmark = pytest.mark.usefixtures("no_curves_in_module")
 GARMENT = "short-pant-male"
+LIKE = "skirt-female"
 HIP = 1
 FPS = 30.0
 seeds = st.integers(0, 2**31)
@@ -474,6 +475,18 @@ def test_sets_are_learnt_from_together(tmp_path: Path) -> None:
     n_frames = len(samples) // 2
     assert [one["samples"], other["samples"]] == [2 * 2 * n_frames, 2 * 3 * n_frames]
     assert both["samples"] == 2 * 4 * n_frames
+
+
+def test_it_goes_on_from_what_a_related_garment_knows(tmp_path: Path) -> None:
+    data = write_sequences(tmp_path / "sequences", count=4, n_test=1, seconds=0.5)
+    samples = read_samples(open_dataset(data), load_body("male"), load_garment(GARMENT), split="train")
+    weights = write(tmp_path / GARMENT, untrained(output_basis(samples.displacement, rank=8)))
+    card = train_dynamics(GARMENT, [data], weights, like=LIKE, settings=DynamicsSettings(steps=1), quiet=True)
+    assert card["start"] == LIKE
+    known, own = (load_weights(folder / "dynamics").tensors for folder in (weights_folder(LIKE), weights))
+    middle = "net.layers.1.weight"  # but for a step of learning, and rounding
+    assert torch.allclose(own[middle].float(), known[middle].float(), atol=2 * DynamicsSettings().later_rate + 2e-3)
+    assert own["net.layers.2.weight"].shape == (8, known["net.layers.2.weight"].shape[1])
 
 
 def test_samples_at_rest_teach_no_motion(tmp_path: Path) -> None:
