@@ -76,9 +76,10 @@ def test_a_forward_pass_gives_the_same_in_inference_mode_and_nothing_for_nobody(
     with torch.inference_mode():
         got = dress(pose, Wearer.of(outfit, betas.clone())).drapes
     none = dress(pose[:0], Wearer.of(outfit, betas[:0])).drapes
+    tracked = dress(pose[:0].clone().requires_grad_(), Wearer.of(outfit, betas[:0])).drapes
     for name, drape in wanted.items():
         assert torch.equal(got[name].vertices, drape.vertices)
-        assert none[name].vertices.shape == (0, *drape.vertices.shape[1:])
+        assert none[name].vertices.shape == tracked[name].vertices.shape == (0, *drape.vertices.shape[1:])
 
 
 @pytest.mark.parametrize("settings", [_SETTINGS[name] for name in ("inference mode", "fine default type")])
