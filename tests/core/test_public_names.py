@@ -20,7 +20,7 @@ from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint
 from refu_core.metrics import SheetChecker
 from refu_core.outputs import PinholeCamera
 from refu_core.refu import Refu, repulse
-from refu_core.sdf import SdfSample
+from refu_core.sdf import SdfSample, query_batch
 
 
 def test_dir_and_star_show_all_public_names() -> None:
@@ -103,6 +103,7 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
         (lambda: load_body("male")(pose="standing"), "pose must be an array or tensor of numbers, got str"),
         (lambda: SmplFrame(pose="standing"), "pose must be .* numbers, got str"),
         (lambda: SmplFrame(pose=np.zeros(72), stamp_ns="now"), "stamp_ns must be a whole number .*, got 'now'"),
+        (lambda: SmplFrame(pose=np.zeros(72), stamp_ns=0.033), "stamp_ns must be a whole number .*, got 0.033"),
         (lambda: posed().query(np.zeros((1, 3))), "points must be a floating-point torch.Tensor, got ndarray"),
         (lambda: posed().query(torch.zeros(1, 3, dtype=torch.long)), "floating-point torch.Tensor, got torch.int64"),
         (lambda: posed().query(torch.zeros(1, 3), near=[0]), "near must be integers .* got list"),
@@ -116,6 +117,10 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
         (lambda: Refu("3", least=1.0), "wanted a number of vertices, got str"),
         (lambda: Refu(3, least=1.0, margin="4 mm"), "wanted a margin in metres, got str"),
         (lambda: Refu(3, least=1.0)(torch.zeros(1, 3, 3), 5), "wanted an SdfSample.*, got int"),
+        (
+            lambda: query_batch(posed(), CORNERS[None], CORNERS),
+            r"wanted points of 1 bodies, .*, got the shape \(4, 3\)",
+        ),
         (lambda: Refu(3, least="1"), "wanted a least α, 0 or 1, got str"),
         (lambda: Refu(3, least=np.nan), "wanted a least α of 0 or 1, got nan"),
         *(
