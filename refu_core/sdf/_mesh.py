@@ -75,7 +75,7 @@ class MeshSdf(Unpicklable, ABC):
     def update(self, vertices: Tensor, *, pose: Tensor | None = None, betas: Tensor | None = None) -> None:
         """Takes over a new pose: `vertices` [m], shape (V, 3). `pose` and `betas` aren't needed here.
 
-        Raises `MeshError` for a wrong shape, values that aren't finite, or a body turned inside out.
+        Raises `MeshError` for a wrong shape, values that aren't finite, or a body that is inside out the first time.
         """
         del pose, betas
         require_tensor("the body's vertices", vertices)
