@@ -191,9 +191,11 @@ _MOST_SIZES = 64
 
 
 def is_plain(*tensors: Tensor) -> bool:
-    """Whether a kernel may compute with the tensors: float32, and no derivative is wanted."""
+    """Whether a kernel may compute with the tensors: float32, no derivative is wanted, and torch compiles nothing."""
     tracks = torch.is_grad_enabled()
-    return all(t.dtype == torch.float32 and not (tracks and t.requires_grad) for t in tensors)
+    return not torch.compiler.is_compiling() and all(
+        t.dtype == torch.float32 and not (tracks and t.requires_grad) for t in tensors
+    )
 
 
 def torch_stream(device: torch.device) -> contextlib.AbstractContextManager[Any]:

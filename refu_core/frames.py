@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -83,9 +84,12 @@ def _direction(name: str, value: ArrayLike) -> NDArray[np.float32]:
 def _nanoseconds(name: str, value: Any) -> int:
     """`value` as a whole number."""
     try:
-        return int(value)
+        whole = int(value)
+        if isinstance(value, Real) and whole != value:  # seconds, most likely
+            raise ValueError("a fraction")
     except (TypeError, ValueError, OverflowError) as error:
         raise FrameError(f"{name} must be a whole number of nanoseconds, got {value!r}") from error
+    return whole
 
 
 @dataclass(frozen=True, eq=False, init=False)

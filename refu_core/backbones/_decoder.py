@@ -100,7 +100,7 @@ class DenseDecoder(nn.Module):
 
     def forward(self, code: Tensor) -> Tensor:
         """Displacements [m], shape (B, V, 3), of codes (B, 3 V)."""
-        return code.view(len(code), -1, 3)
+        return code.view(len(code), self.n_vertices, 3)
 
     def encode(self, displacement: Tensor) -> Tensor:
         """Codes, shape (B, 3 V), of displacements (B, V, 3) [m]."""
@@ -177,7 +177,7 @@ class BasisDecoder(nn.Module):
             if self._strips is None or not self._strips.is_of(self.components):
                 self._strips = _Strips(self.mean, self.components)
             return self._strips(code)
-        return torch.addmm(self.mean, code, self.components).view(len(code), -1, 3)
+        return torch.addmm(self.mean, code, self.components).view(len(code), self.n_vertices, 3)
 
     def encode(self, displacement: Tensor) -> Tensor:
         """Codes, shape (B, R), of the displacements nearest to `displacement` (B, V, 3) [m]."""

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from refu_core._warp import Repeated, is_plain
 from refu_core.backbones._feature_kernels import features_kernel
-from refu_core.body import rotvec_to_rotmat, up_in
+from refu_core.body import require_batch, rotvec_to_rotmat, up_in
 from refu_core.errors import RefuError
-from refu_core.frames import N_BETAS, N_STYLES
+from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 from refu_core.garments import GarmentTemplate
 
 N_STYLE_SHAPE = N_BETAS + N_STYLES
@@ -125,7 +125,8 @@ class PoseFeatures(nn.Module):
         return torch.cat((carries[joints[self.groups[: self.size]]], torch.ones(N_STYLE_SHAPE, dtype=torch.bool)))
 
     def forward(self, pose: Tensor) -> Tensor:
-        """Features, shape (B, size), of poses (B, 24, 3) [rad]."""
+        """Features, shape (B, size), of poses (B, 24, 3) [rad]. Raises `FrameError` for anything else."""
+        require_batch("pose", pose, (N_JOINTS, 3))
         if self.encoding == "rotvec":
             whole = torch.cat((tilt_rotvec(told_up(up_in_root(pose)))[:, None], pose[:, 1:]), 1)
             return (whole * self._keep).flatten(1)

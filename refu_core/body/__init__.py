@@ -11,6 +11,7 @@ from refu_core.body._fit import load_fit as load_fit
 from refu_core.body._io import load_body as load_body
 from refu_core.body._kinematics import RigidTransforms as RigidTransforms
 from refu_core.body._kinematics import forward_kinematics as forward_kinematics
+from refu_core.body._kinematics import require_batch as require_batch
 from refu_core.body._kinematics import rotvec_to_rotmat as rotvec_to_rotmat
 from refu_core.body._kinematics import up_in as up_in
 from refu_core.body._model import BodyOutput as BodyOutput

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -11,9 +12,24 @@ from torch import Tensor
 
 from refu_core._warp import Repeated, is_plain
 from refu_core.body._pose_kernels import UP_STEP, chain_kernel, rotation_kernel
-from refu_core.errors import FrameError
+from refu_core.errors import FrameError, require_type
 from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
 from refu_core.skeleton import PARENTS as PARENTS
+
+
+def require_batch(
+    name: str, value: Tensor, row: tuple[int, ...], *, dtype: torch.dtype | None = None, sizes: Sequence[int] = ()
+) -> None:
+    """Raises `FrameError` unless `value` is a tensor (B, *row), of this type and with B in `sizes` if they are given.
+
+    Kernels read what they are given without a check of their own.
+    """
+    require_type(value, Tensor, f"{name} as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
+    is_typed = value.dtype == dtype or dtype is None
+    if value.shape[1:] != row or not value.ndim or not is_typed or (sizes and len(value) not in sizes):
+        kind, batch = dtype or "a tensor", " or ".join(map(str, dict.fromkeys(sizes))) or "B"
+        msg = f"{name} must be {kind} of the shape ({', '.join(map(str, (batch, *row)))}), "
+        raise FrameError(f"{msg}got {value.dtype} of the shape {tuple(value.shape)}")
 
 
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from refu_core._device import checked_device
 from refu_core.body._fingers import without_fingers
-from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, rotvec_to_rotmat
+from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, require_batch, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
-from refu_core.errors import BodyError, FrameError, require_type
+from refu_core.errors import BodyError, FrameError
 from refu_core.frames import N_BETAS, N_JOINTS
 
 N_POSE_FEATURES = 9 * (N_JOINTS - 1)
-_TENSOR = "{} as a torch.Tensor, such as torch.as_tensor(array) gives"
 _LARGEST = 1e6
 """No model has larger numbers, and products of much larger ones are infinite in float32."""
 _OTHERS = {5: "FLAME's, a head", 16: "MANO's, a hand", 33: "SMAL's, an animal", 35: "SMAL's, an animal", 75: "SUPR's"}
@@ -255,17 +254,17 @@ class SmplBody:
     def rest_joints(self, betas: Tensor) -> Tensor:
         """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10).
 
-        Raises `FrameError` for anything but a tensor.
+        Raises `FrameError` for anything but such a tensor.
         """
-        require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
+        require_batch("betas", betas, (N_BETAS,))
         return self.joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
         """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10).
 
-        Raises `FrameError` for anything but a tensor.
+        Raises `FrameError` for anything but such a tensor.
         """
-        require_type(betas, Tensor, _TENSOR.format("betas"), error=FrameError)
+        require_batch("betas", betas, (N_BETAS,))
         return torch.addmm(self.v_template.view(1, -1), betas, self._shapedirs).view(-1, self.n_vertices, 3)
 
     def __call__(
@@ -302,9 +301,9 @@ class SmplBody:
     def posed(self, pose: Tensor, shape: Shape) -> BodyOutput:
         """Poses bodies by rotation vectors (B, 24, 3) [rad]; `shape` has as many bodies, or one for all.
 
-        Raises `FrameError` for anything but a tensor.
+        Raises `FrameError` for anything but such a tensor.
         """
-        require_type(pose, Tensor, _TENSOR.format("pose"), error=FrameError)
+        require_batch("pose", pose, (N_JOINTS, 3))
         rotations = rotvec_to_rotmat(pose)
         joints, transforms = forward_kinematics(rotations, shape.joints)
         vertices = shape.vertices
@@ -319,6 +318,7 @@ def _tensor(name: str, value: ArrayLike | Tensor, device: torch.device) -> Tenso
     if isinstance(value, Tensor):
         return value.to(device)
     try:
-        return torch.tensor(np.asarray(value), device=device)
+        array = np.asarray(value)  # torch knows no foreign byte order, and no negative strides
+        return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C")).to(device)
     except (TypeError, ValueError) as error:
         raise FrameError(f"{name} must be an array or tensor of numbers, got {type(value).__name__}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,10 +13,10 @@ from torch import Tensor
 from refu_core._warp import Recorded, Repeated, Unpicklable, as_warp, ints, memory, torch_stream
 from refu_core.contact import _edge_kernels, _parting_kernels, _resolver_kernels, _round_kernels, _state
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
-from refu_core.errors import MeshError
+from refu_core.errors import MeshError, require_type
 from refu_core.mesh import Connectivity
 from refu_core.modes import DEFAULT_MARGIN
-from refu_core.refu import VertexScale
+from refu_core.refu import VertexScale, require_margin
 from refu_core.sdf import MeshSdf, SdfSample, require_finite, require_tensor
 
 
@@ -137,8 +136,8 @@ class Resolver(Unpicklable):
             raise MeshError(f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}")
         if self._is_serial:  # a GPU would have to be waited for
             require_finite("points", points)
-        if not 0 <= margin < math.inf:
-            raise MeshError(f"wanted a margin of 0 m or more, got {margin}")
+        require_margin(margin)
+        require_type(sdf, MeshSdf, "a distance to faces, such as an ExactSdf", error=MeshError)
         if start is None and sdf is not self._last_sdf:
             msg = "nothing to go on from: the last call wasn't for this sdf; give what it says of the points as start"
             raise MeshError(msg)

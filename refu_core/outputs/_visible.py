@@ -56,7 +56,8 @@ class PinholeCamera:
         numbers = [*self.focal, *self.centre, *rotation.ravel(), *translation.ravel()]
         is_sized = min(self.width, self.height, *self.focal) > 0 and bool(np.isfinite(numbers).all())
         is_shaped = (rotation.shape, translation.shape) == ((3, 3), (3,))
-        if not (is_sized and is_shaped) or np.abs(rotation @ rotation.T - np.eye(3)).max() >= 1e-3:
+        is_turn = is_shaped and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
+        if not (is_sized and is_turn):
             msg = (
                 "a camera has a size in pixels, positive focal lengths, a rotation (3, 3) and a translation (3,), got "
                 f"{self.width} x {self.height}, {self.focal}, {rotation.tolist()}, {translation.tolist()}"

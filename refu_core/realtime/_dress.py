@@ -8,11 +8,11 @@ from typing import NamedTuple
 from torch import Tensor
 
 from refu_core.backbones import MAX_OFFSET, upright
-from refu_core.body import RigidTransforms
+from refu_core.body import RigidTransforms, require_batch
 from refu_core.errors import FrameError, require_type
 from refu_core.frames import LAGS, N_JOINTS, N_PAST
 from refu_core.realtime._turn import RootTurn
-from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer, require_batch
+from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer
 from refu_core.refu import VertexScale
 
 Lap = Callable[[str, str | None], None]
@@ -56,15 +56,19 @@ def dress(
     Cloth hangs away from `up` (B, 3), of unit length and in the axes that roots are given in; +y by default.
     A backbone that heeds the past takes it from `past` (B, 4, 219), which `PoseHistory` explains; by default people
     stood still. Where a collider pulls the skin apart, the cloth that lies on it moves along (`SkinBelow`).
-    Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors and
-    differentiable: nothing is remembered, and no device is waited for. `lap` is called at the end of each stage.
+    Pipeline, CUDA graph, training, evaluation and benchmark all call this. It is a pure function of tensors: nothing is
+    remembered, and no device is waited for. `lap` is called at the end of each stage.
+
+    Differentiable, with one exception: how a TailorNet mixes its folds, which depends on (β, γ) alone, counts as
+    constant (`TailorNet.mixture`). So derivatives along β and γ are approximate, those along the pose are not.
     """
     require_type(wearer, Wearer, "a Wearer, such as Wearer.of(outfit, betas) gives", error=FrameError)
-    require_batch("pose", pose, (N_JOINTS, 3), wearer.outfit, sizes=(len(wearer.betas),))
+    dtype = wearer.outfit.body.dtype
+    require_batch("pose", pose, (N_JOINTS, 3), dtype=dtype, sizes=(len(wearer.betas),))
     if past is not None:
-        require_batch("past", past, (len(LAGS), N_PAST), wearer.outfit, sizes=(len(pose),))
+        require_batch("past", past, (len(LAGS), N_PAST), dtype=dtype, sizes=(len(pose),))
     if up is not None:
-        require_batch("up", up, (3,), wearer.outfit, sizes=(len(pose),))
+        require_batch("up", up, (3,), dtype=dtype, sizes=(len(pose),))
     turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
     posed = wearer.outfit.body.posed(at_root, wearer.shape)
     lap("body", None)

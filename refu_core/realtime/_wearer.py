@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from refu_core.backbones import Backbone
-from refu_core.body import BodyFit, Collider, Shape, ShapeMap, SmplBody
-from refu_core.errors import FrameError, require_type
+from refu_core.body import BodyFit, Collider, Shape, ShapeMap, SmplBody, require_batch
 from refu_core.frames import N_BETAS, N_STYLES
 from refu_core.garments import GarmentTemplate, SkinBelow
 from refu_core.refu import Refu
@@ -107,9 +106,10 @@ class Wearer:
 
         Differentiable. Raises `FrameError` for anything but tensors of these shapes in the body's precision.
         """
-        require_batch("betas", betas, (N_BETAS,), outfit)
+        dtype = outfit.body.dtype
+        require_batch("betas", betas, (N_BETAS,), dtype=dtype)
         if style is not None:
-            require_batch("style", style, (N_STYLES,), outfit, sizes=(1, len(betas)))
+            require_batch("style", style, (N_STYLES,), dtype=dtype, sizes=(1, len(betas)))
         mean = betas.new_zeros(1, betas.shape[1])
         garments = {}
         for name, one in outfit.wearables.items():
@@ -145,16 +145,6 @@ class Wearer:
         for name, garment in self.garments.items():
             found |= {f"{name}/{field}": tensor for field, tensor in garment._asdict().items() if tensor is not None}
         return found
-
-
-def require_batch(name: str, value: Tensor, row: tuple[int, ...], outfit: Outfit, sizes: Sequence[int] = ()) -> None:
-    """Raises `FrameError` unless `value` is a tensor (B, *row) of the body's precision, with B in `sizes` if given."""
-    dtype, wanted = outfit.body.dtype, " or ".join(map(str, dict.fromkeys(sizes))) or "B"
-    require_type(value, Tensor, f"{name} as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
-    if value.shape[1:] != row or not value.ndim or value.dtype != dtype or (sizes and len(value) not in sizes):
-        msg = f"{name} must be {dtype} of the shape ({', '.join(map(str, (wanted, *row)))}), "
-        msg += f"got {value.dtype} of the shape {tuple(value.shape)}"
-        raise FrameError(msg)
 
 
 def _cast(wearable: Wearable, dtype: torch.dtype) -> Wearable:

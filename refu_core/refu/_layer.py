@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from numbers import Integral, Real
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 from refu_core.errors import MeshError, WeightsError, require_type
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu._scale import REALTIME, ScaleNet, ScaleSettings, VertexScale
-from refu_core.refu._unit import pushed_rows, repulse
+from refu_core.refu._unit import pushed_rows, repulse, require_margin
 from refu_core.sdf import SdfSample, require_tensor
 from refu_core.weights import config_of_card
 
@@ -29,7 +28,7 @@ class Refu(nn.Module):
     def __init__(
         self, n_vertices: int, *, least: float, scale: ScaleSettings | None = REALTIME, margin: float = DEFAULT_MARGIN
     ) -> None:
-        """A layer for garments of `n_vertices`. Raises `MeshError` for none, and for a margin below 0 or not finite.
+        """A layer for garments of `n_vertices`. Raises `MeshError` for none, a bad margin, or a bad `least`.
 
         Args:
             least: lower end of α's range: 1 with an accurate distance, 0 with an approximate one (paper, Sec. 3.1).
@@ -40,9 +39,10 @@ class Refu(nn.Module):
         require_type(n_vertices, Integral, "a number of vertices", error=MeshError)
         if n_vertices < 1:
             raise MeshError(f"wanted a garment of at least one vertex, got {n_vertices}")
-        require_type(margin, Real, "a margin in metres", error=MeshError)
-        if not 0 <= margin < math.inf:
-            raise MeshError(f"wanted a margin of 0 m or more, got {margin}")
+        require_margin(margin)
+        require_type(least, Real, "a least α, 0 or 1", error=MeshError)
+        if not 0 <= least <= 1:
+            raise MeshError(f"wanted a least α of 0 or 1, got {least}")
         self.config: dict[str, Any] = {
             "n_vertices": n_vertices,
             "least": least,

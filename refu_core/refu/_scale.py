@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from refu_core._warp import Repeated, is_plain
-from refu_core.body import rotvec_to_rotmat, up_in
+from refu_core.body import require_batch, rotvec_to_rotmat, up_in
 from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES
 from refu_core.refu._scale_kernels import scale_inputs_kernel
 
@@ -94,7 +94,10 @@ class ScaleNet(nn.Module):
         self.g = nn.Sequential(nn.Linear(latent + 1, d), nn.ReLU(), last)
 
     def feature(self, betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
-        """z, shape (B, M), of betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4)."""
+        """z, shape (B, M), of betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4), (1, 4) or None.
+
+        Raises `FrameError` for anything but tensors of these shapes.
+        """
         if self.settings.kind == "distance":
             return betas[:, :0]
         z: Tensor = self.h(scale_inputs(betas, pose, style))
@@ -141,12 +144,17 @@ class ScaleNet(nn.Module):
 
 
 def scale_inputs(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
-    """What h reads, shape (B, 86), from betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4) or None for the mean one.
+    """What h reads, shape (B, 86), from betas (B, 10), pose (B, 24, 3) [rad] and style (B, 4) or (1, 4), or None.
 
-    The root's rotation enters as the direction of gravity, which is all of it that a garment can feel. The other
-    rotation vectors enter with angles up to π: callers may pass larger ones.
+    No style is the mean one. The root's rotation enters as the direction of gravity, which is all of it that a garment
+    can feel. The other rotation vectors enter with angles up to π: callers may pass larger ones.
+
+    Raises `FrameError` for anything but tensors of these shapes.
     """
-    gamma = betas.new_zeros(len(betas), N_STYLES) if style is None else style
+    require_batch("betas", betas, (N_BETAS,))
+    require_batch("pose", pose, (N_JOINTS, 3), sizes=(len(betas),))
+    gamma = betas.new_zeros(1, N_STYLES) if style is None else style
+    require_batch("style", gamma, (N_STYLES,), sizes=(1, len(betas)))
     if is_plain(betas, pose, gamma):
         inputs = pose.new_empty(len(pose), N_INPUTS)
         _read((len(pose),), *(one.contiguous() for one in (pose, betas, gamma)), inputs)
@@ -155,7 +163,7 @@ def scale_inputs(betas: Tensor, pose: Tensor, style: Tensor | None) -> Tensor:
     wrapped = torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
     joints = pose * (wrapped / angle.clamp_min(1e-6))
     up = up_in(rotvec_to_rotmat(joints[:, 0]))
-    return torch.cat((betas, joints[:, 1:].flatten(1), up, gamma), dim=1)
+    return torch.cat((betas, joints[:, 1:].flatten(1), up, gamma.expand(len(betas), -1)), dim=1)
 
 
 _read = Repeated(scale_inputs_kernel, (wp.vec3, wp.float32, wp.float32, wp.float32))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
+
 import torch
 from torch import Tensor
 
-from refu_core.errors import MeshError
+from refu_core.errors import MeshError, require_type
 from refu_core.sdf import SdfSample, require_tensor
 
 MAX_DISPLACEMENT = 0.1
@@ -24,7 +27,7 @@ def repulse(points: Tensor, sample: SdfSample, *, scale: float | Tensor = 1.0, m
     Gradients needn't have unit length, and one that is zero or not finite is replaced by up. `scale` is α, one number
     or shape (N,); 1 is the paper's "fixed scale". `margin` is ε ≥ 0 [m].
 
-    Raises `MeshError` for arrays whose shapes don't belong together, or a negative margin.
+    Raises `MeshError` for tensors whose shapes don't belong together, or a margin that is negative or not finite.
     """
     _check(points, sample, scale, margin)
     rows = pushed_rows(sample.distance, margin)
@@ -53,6 +56,8 @@ def unit_direction(gradient: Tensor) -> Tensor:
 
 def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: float) -> None:
     require_tensor("points", points)
+    require_type(sample, SdfSample, "an SdfSample, as the query of a signed distance gives", error=MeshError)
+    require_margin(margin)
     n = len(points)
     if points.shape != (n, 3) or sample.distance.shape != (n,) or sample.gradient.shape != (n, 3):
         msg = (
@@ -62,5 +67,10 @@ def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: flo
         raise MeshError(msg)
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
         raise MeshError(f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}")
-    if not margin >= 0:
-        raise MeshError(f"the margin must not be negative, got {margin}")
+
+
+def require_margin(margin: object) -> None:
+    """Raises `MeshError` for what isn't a margin: one number of 0 m or more, or a tensor of one."""
+    require_type(margin, (Real, Tensor), "a margin in metres", error=MeshError)
+    if not 0 <= margin < math.inf:  # type: ignore[operator]
+        raise MeshError(f"the margin must not be negative: wanted a margin of 0 m or more, got {margin}")

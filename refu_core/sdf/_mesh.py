@@ -11,6 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
+from refu_core._device import checked_device
 from refu_core._warp import Repeated, Unpicklable, as_warp, ints, memory
 from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate
@@ -58,7 +59,7 @@ class MeshSdf(Unpicklable, ABC):
 
     def __init__(self, faces: Tensor | NDArray[Any], *, device: str | torch.device = "cpu") -> None:
         mesh = Connectivity.of(faces)
-        self.device = torch.device(device)
+        self.device = checked_device(device)
         self.n_vertices = mesh.n_vertices
         self.faces = torch.as_tensor(mesh.faces, device=self.device)
         self._posed = PosedMesh()
@@ -74,7 +75,7 @@ class MeshSdf(Unpicklable, ABC):
     def update(self, vertices: Tensor, *, pose: Tensor | None = None, betas: Tensor | None = None) -> None:
         """Takes over a new pose: `vertices` [m], shape (V, 3). `pose` and `betas` aren't needed here.
 
-        Raises `MeshError` for a wrong shape, values that aren't finite, or a body turned inside out.
+        Raises `MeshError` for a wrong shape, values that aren't finite, or a body that is inside out the first time.
         """
         del pose, betas
         require_tensor("the body's vertices", vertices)

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from refu_core.errors import MeshError
 from refu_core.garments import GarmentTemplate
 
 
@@ -87,7 +88,11 @@ def query_batch(
     Bodies are queried one after the other: derivatives of all are kept, and `sdf` is left at the last one. They have
     `vertices` (B, V, 3) [m] and are queried at `points` (B, N, 3) [m], with `near` faces (N,) for all or (B, N); `pose`
     (B, 24, 3) [rad] and `betas` (B, 10) are what they were posed by.
+
+    Raises `MeshError` for another number of bodies than of points, and as `sdf`.
     """
+    if len(vertices) != len(points):
+        raise MeshError(f"wanted points of {len(vertices)} bodies, (B, N, 3), got the shape {tuple(points.shape)}")
     samples = []
     for i, (body, here) in enumerate(zip(vertices, points, strict=True)):
         sdf.update(body, pose=None if pose is None else pose[i], betas=None if betas is None else betas[i])

@@ -193,6 +193,14 @@ def test_wrong_shapes(
         load_body("male")(pose, betas, transl)
 
 
+def test_arrays_may_lie_in_memory_as_they_please() -> None:
+    pose = np.random.default_rng(0).normal(scale=0.3, size=(2, 24, 3)).astype(np.float32)
+    body = load_body("male")
+    wanted = body(pose).vertices
+    for same in (pose[::-1].copy()[::-1], pose.astype(">f4"), np.asfortranarray(pose), list(torch.tensor(pose))):
+        assert torch.equal(body(same).vertices, wanted)
+
+
 @pytest.mark.parametrize("wanted", [torch.float16, torch.int64, np.float32, "float32"])
 def test_a_body_is_single_or_double(wanted: Any) -> None:
     for make in (partial(load_body, "male"), load_body("male").to):

@@ -411,6 +411,7 @@ def test_what_is_seen_of_two_squares() -> None:
         (lambda: PinholeCamera.looking_at([0, 0, 0], [0, 1, 0]), "can't have .* in the middle and the y axis up"),
         (lambda: PinholeCamera(0, 1, (1, 1), (0, 0), np.eye(3), np.zeros(3)), "a camera has a size in pixels"),
         (lambda: PinholeCamera(9, 9, (1, 1), (0, 0), 2 * np.eye(3), np.zeros(3)), "a camera has a size in pixels"),
+        (lambda: PinholeCamera(9, 9, (1, 1), (0, 0), np.diag([1, 1, -1]), np.zeros(3)), "a camera has .* a rotation"),
     ],
 )
 def test_bad_input_gets_a_sentence(call, said: str) -> None:

@@ -15,11 +15,12 @@ import torch
 
 import refu_core
 from refu_core import ExactSdf, GarmentPipeline, PoseHistory, RefuError, Resolver, SmplFrame, load_body
+from refu_core.backbones import PoseFeatures
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint_layout
 from refu_core.metrics import SheetChecker
 from refu_core.outputs import PinholeCamera
 from refu_core.refu import Refu, repulse
-from refu_core.sdf import SdfSample
+from refu_core.sdf import SdfSample, query_batch
 
 
 def test_dir_and_star_show_all_public_names() -> None:
@@ -102,6 +103,7 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
         (lambda: load_body("male")(pose="standing"), "pose must be an array or tensor of numbers, got str"),
         (lambda: SmplFrame(pose="standing"), "pose must be .* numbers, got str"),
         (lambda: SmplFrame(pose=np.zeros(72), stamp_ns="now"), "stamp_ns must be a whole number .*, got 'now'"),
+        (lambda: SmplFrame(pose=np.zeros(72), stamp_ns=0.033), "stamp_ns must be a whole number .*, got 0.033"),
         (lambda: posed().query(np.zeros((1, 3))), "points must be a floating-point torch.Tensor, got ndarray"),
         (lambda: posed().query(torch.zeros(1, 3, dtype=torch.long)), "floating-point torch.Tensor, got torch.int64"),
         (lambda: posed().query(torch.zeros(1, 3), near=[0]), "near must be integers .* got list"),
@@ -115,6 +117,29 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
         (lambda: Refu("3", least=1.0), "wanted a number of vertices, got str"),
         (lambda: Refu(3, least=1.0, margin="4 mm"), "wanted a margin in metres, got str"),
         (lambda: Refu(3, least=1.0)(torch.zeros(1, 3, 3), 5), "wanted an SdfSample.*, got int"),
+        (
+            lambda: query_batch(posed(), CORNERS[None], CORNERS),
+            r"wanted points of 1 bodies, .*, got the shape \(4, 3\)",
+        ),
+        (lambda: Refu(3, least="1"), "wanted a least α, 0 or 1, got str"),
+        (lambda: Refu(3, least=np.nan), "wanted a least α of 0 or 1, got nan"),
+        *(
+            (lambda given=given: Refu(3, least=1.0).feature(*given), said)
+            for given, said in (
+                ((np.zeros((1, 10)), torch.zeros(1, 24, 3), None), "wanted betas as a torch.Tensor.*, got ndarray"),
+                ((torch.zeros(1, 10), torch.zeros(1, 72), None), r"pose must .* shape \(1, 24, 3\), got .* \(1, 72\)"),
+                ((torch.zeros(2, 10), torch.zeros(1, 24, 3), None), r"pose must be .* shape \(2, 24, 3\)"),
+                ((torch.zeros(1, 10), torch.zeros(1, 24, 3), torch.zeros(1, 3)), r"style must .* shape \(1, 4\)"),
+            )
+        ),
+        (lambda: repulse(CORNERS, SAMPLE[:2]), "wanted an SdfSample.*, got tuple"),
+        (lambda: repulse(CORNERS, SAMPLE, margin="4 mm"), "wanted a margin in metres, got str"),
+        (lambda: resolver()(torch.zeros(3, 3), posed(), SAMPLE, margin=None), "a margin in metres, got NoneType"),
+        (lambda: resolver()(torch.zeros(3, 3), None, SAMPLE), "wanted a distance to faces.*, got NoneType"),
+        (lambda: ExactSdf(TETRAHEDRON, device="meta"), "no device 'meta': wanted cpu or cuda"),
+        (lambda: load_body("male").rest_vertices(torch.zeros(1, 16)), r"betas must .* shape \(B, 10\), got .*16"),
+        (lambda: load_body("male").rest_joints(torch.zeros(10)), r"betas must be .* shape \(B, 10\)"),
+        (lambda: PoseFeatures((1, 20), "matrix")(torch.zeros(2, 10, 3)), r"pose must be .* shape \(B, 24, 3\)"),
         (lambda: pipeline().adjusted(FRAME, 3), "wanted a function of a Dressed, got int"),
         (lambda: pipeline().adjusted(FRAME, lambda _: None), "wanted a Dressed from what adjusts it, got NoneType"),
         (lambda: SheetChecker([[0, 1, 2]]).with_itself(), r"no garment yet: call update\(vertices\)"),

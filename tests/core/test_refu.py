@@ -159,6 +159,12 @@ def _homogeneous(rotation: Any) -> Any:
     return matrix
 
 
+def test_one_style_is_everybodys_also_where_derivatives_are_wanted() -> None:
+    betas, pose, style = random_bodies(2)
+    tracked = scale_inputs(betas, pose.clone().requires_grad_(), style[:1])
+    torch.testing.assert_close(tracked, scale_inputs(betas, pose, style[[0, 0]]))
+
+
 def test_the_mean_style_is_zero() -> None:
     betas, pose, style = random_bodies(2)
     assert torch.equal(scale_inputs(betas, pose, None), scale_inputs(betas, pose, torch.zeros_like(style)))

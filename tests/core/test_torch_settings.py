@@ -76,9 +76,21 @@ def test_a_forward_pass_gives_the_same_in_inference_mode_and_nothing_for_nobody(
     with torch.inference_mode():
         got = dress(pose, Wearer.of(outfit, betas.clone())).drapes
     none = dress(pose[:0], Wearer.of(outfit, betas[:0])).drapes
+    tracked = dress(pose[:0].clone().requires_grad_(), Wearer.of(outfit, betas[:0])).drapes
     for name, drape in wanted.items():
         assert torch.equal(got[name].vertices, drape.vertices)
-        assert none[name].vertices.shape == (0, *drape.vertices.shape[1:])
+        assert none[name].vertices.shape == tracked[name].vertices.shape == (0, *drape.vertices.shape[1:])
+
+
+def test_a_forward_pass_can_be_compiled() -> None:
+    outfit = GarmentPipeline.load(["tshirt-male"], collider=False).outfit
+    pose, betas = 0.1 * torch.ones(2, 24, 3), torch.ones(2, 10)
+
+    def vertices(pose: torch.Tensor) -> list[torch.Tensor]:
+        return [drape.vertices for drape in dress(pose, Wearer.of(outfit, betas)).drapes.values()]
+
+    for got, wanted in zip(torch.compile(vertices, backend="eager")(pose), vertices(pose), strict=True):
+        torch.testing.assert_close(got, wanted, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("settings", [_SETTINGS[name] for name in ("inference mode", "fine default type")])
