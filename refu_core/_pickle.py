@@ -87,7 +87,7 @@ class PickledArrays:
         _, name, key = exactly(Record, storage).args[:3]
         kind = exactly(Name, name).kind
         if given is None or not is_plain(kind) or type(key) is not str:
-            raise ValueError("a tensor without its numbers, or of a type that isn't read")
+            raise ValueError("a tensor without its numbers, or of a type that isn't read: save it as float32")
         shape, strides = (tuple(operator.index(n) for n in exactly(tuple, pair)) for pair in (shape, strides))
         if len(shape) != len(strides) or min((*shape, *strides, operator.index(offset)), default=0) < 0:
             raise ValueError(f"a tensor of the shape {str(shape)[:80]} and the strides {str(strides)[:80]}")

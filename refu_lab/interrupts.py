@@ -47,6 +47,10 @@ def interruptible() -> Iterator[None]:
     sys.unraisablehook = unraised
     try:
         yield
+    except SystemError as error:  # an interrupt during a function that Numba has compiled is only the cause of one
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            raise error.__cause__ from None
+        raise
     finally:
         sys.unraisablehook = hook
         if signal.getsignal(signal.SIGALRM) is not alarm:

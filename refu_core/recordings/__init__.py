@@ -1,6 +1,7 @@
 """Recorded motion: one reader for what archives, pose estimators and motion capture write."""
 
 from refu_core.recordings._layouts import SUFFIXES as SUFFIXES
+from refu_core.recordings._layouts import is_named_as_motion as is_named_as_motion
 from refu_core.recordings._read import read_recording as read_recording
 from refu_core.recordings._recording import FASTEST as FASTEST
 from refu_core.recordings._recording import FPS_RANGE as FPS_RANGE

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Any
 
 from refu_core.recordings._followed import N_KEYPOINTS
@@ -14,6 +15,14 @@ from refu_core.recordings._rotations import BODY, WHOLE
 
 SUFFIXES = (".npz", ".npy", ".pkl", ".pickle", ".pk", ".p", ".joblib", ".pt", ".pth", ".smpl", ".bvh")
 """Suffixes of files that hold motion."""
+
+
+def is_named_as_motion(name: str) -> bool:
+    """Whether a file found in a folder may hold motion. AMASS keeps shapes beside its motions, macOS notes (`._…`)."""
+    path = PurePath(name)
+    is_beside = path.name == "shape.npz" or path.stem.endswith("_stagei") or path.name.startswith(".")
+    return path.suffix.lower() in SUFFIXES and not is_beside
+
 
 ROOT_PLACES = ("root_translation", "root_trans", "root_transl")
 PELVIS_PLACES = ("root_trans_offset", "root_trans_world", "root_trans_cam")

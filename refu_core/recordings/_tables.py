@@ -51,7 +51,8 @@ def numbers_of(content: Content, node: Mapping[Key, Any]) -> NDArray[Any] | None
     for name in table.FRAME_NUMBERS:
         array = None if node.get(name) is None else content.column(node[name])
         if array is not None and array.dtype.kind in "iuf":  # else a count of frames, or their pictures
-            return array
+            is_whole = array.dtype.kind == "f" and bool(((array == np.round(array)) & (np.abs(array) < 2**53)).all())
+            return array.astype(np.int64) if is_whole else array  # tables of text give floats
     return None
 
 

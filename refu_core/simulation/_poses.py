@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from refu_core.body import MIRRORED_JOINTS
 from refu_core.errors import SimulationError
 from refu_core.frames import N_JOINTS
-from refu_core.recordings import SUFFIXES, Axes, interpolated, n_resampled, read_recording
+from refu_core.recordings import SUFFIXES, Axes, interpolated, is_named_as_motion, n_resampled, read_recording
 from refu_core.skeleton import JOINT_NAMES, posed
 
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
@@ -75,9 +75,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     path = Path(path)
     files = [path]
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES)
-        # AMASS keeps shapes without motion among its motions.
-        files = [file for file in files if file.name != "shape.npz" and not file.stem.endswith("_stagei")]
+        files = sorted(file for file in path.rglob("*") if is_named_as_motion(file.name))
     if not files or not files[0].exists():
         raise SimulationError(f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder or a file")
     clips, folder = [], path if path.is_dir() else path.parent

@@ -15,6 +15,7 @@ from msg_adapters import BAG_SUFFIXES
 from refu_core import RefuError
 from refu_core.errors import printable
 from refu_core.recordings import SUFFIXES as MOTION_SUFFIXES
+from refu_core.recordings import is_named_as_motion
 from refu_lab.fleet._storage import filesystem, is_url
 
 SUFFIXES = (*BAG_SUFFIXES, *MOTION_SUFFIXES)
@@ -111,7 +112,7 @@ def _walk(steps: Iterable[tuple[str, Any, Iterable[str]]], folder: str) -> Itera
         is_hidden = any(part.startswith(".") for part in place.relative_to(folder).parts)
         if is_hidden or any(bag in place.parents for bag in bags):
             continue
-        mine = sorted(name for name in files if name.endswith(SUFFIXES) and not name.startswith("."))
+        mine = sorted(filter(_is_recording, files))
         stems = [_SPLIT.fullmatch(Path(name).stem) if name.endswith(BAG_SUFFIXES) else None for name in mine]
         of_one = [stem is not None and stem[1] == Path(place).absolute().name for stem in stems]
         if _METADATA in files or (mine and all(of_one)):
@@ -119,6 +120,10 @@ def _walk(steps: Iterable[tuple[str, Any, Iterable[str]]], folder: str) -> Itera
             yield str(place)
         else:
             yield from (str(place / name) for name in mine)
+
+
+def _is_recording(name: str) -> bool:
+    return is_named_as_motion(name) or (name.endswith(BAG_SUFFIXES) and not name.startswith("."))
 
 
 def _place(source: str) -> PurePosixPath:

@@ -70,7 +70,10 @@ class Folder:
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:
-        """An empty folder on this machine, deleted with its content when the block ends."""
+        """An empty folder on this machine, deleted with its content when the block ends.
+
+        What is in it is called as it will be in its place, which errors name instead.
+        """
         with self._errors():
             if is_url(self.place):
                 own = Path(tempfile.mkdtemp(prefix="refu-"))
@@ -79,6 +82,10 @@ class Folder:
                 own.mkdir(parents=True)
         try:
             yield own
+        except RefuError as error:
+            if is_url(self.place):  # the disk of this machine is at fault
+                raise
+            raise type(error)(str(error).replace(str(own), self.place.rstrip("/"))) from error
         finally:
             shutil.rmtree(own, ignore_errors=True)
 

@@ -150,7 +150,7 @@ def _make(options: FleetOptions, recording: Input, path: Path) -> dict[str, Any]
     told: dict[str, Any] = {"input": recording.source, "output": None, "output_bytes": None}
     output = None if options.output is None else Folder(options.output)
     with nullcontext() if output is None else output.scratch() as own:
-        bag = None if own is None else own / f"{Path(name).name}.mcap"  # a bag contains its own name
+        bag = None if own is None else own / f"{name}.mcap"  # a bag contains its own name
         asked = replace(options.replay, input=path, output=bag)
         result = replay(asked, source=open_source(asked, pipeline_for(options.replay)))
         if result.interrupted:  # a record is of a whole recording
@@ -163,8 +163,8 @@ def _make(options: FleetOptions, recording: Input, path: Path) -> dict[str, Any]
 
         folder = Folder(options.report)
         with folder.scratch() as scratch:
-            write_report(result, scratch / "page")
-            folder.put(scratch / "page", name)
+            write_report(result, scratch / name)
+            folder.put(scratch / name, name)
     return result.as_dict() | _over_all(result) | told
 
 

@@ -184,6 +184,16 @@ def test_columns_that_tell_nobody_apart_change_nothing(tmp_path: Path) -> None:
         np.testing.assert_array_equal(motion.poses, wanted.poses)
 
 
+def test_lost_frames_by_numbers_that_a_table_of_text_gave(tmp_path: Path) -> None:
+    kept = np.delete(np.arange(T), [10, 11])
+    arrays = {"poses": POSES[kept], "trans": TRANSL[kept]}
+    motion = read_motion(save(tmp_path / "a.npz", **arrays, frame_ids=kept.astype(float)))
+    assert "2 of 30 frames are missing: interpolated" in motion.notes
+    tracks = {"poses": np.tile(POSES, (2, 1, 1)), "trans": np.tile(TRANSL, (2, 1)), "sub": ["a"] * T + ["b"] * T}
+    motion = read_motion(save(tmp_path / "a.npz", **tracks, frame_ids=np.tile(np.arange(T), 2) / 1.0), person="b")
+    np.testing.assert_array_equal(motion.transl, TRANSL)
+
+
 @pytest.mark.parametrize("name", ["frame_ids", "frame_idx", "frame", "frames", "imgname"])
 @pytest.mark.parametrize("above", [False, True])
 def test_lost_frames_by_any_name(name: str, above: bool, tmp_path: Path) -> None:

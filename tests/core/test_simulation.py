@@ -667,6 +667,7 @@ def test_motions_lie_in_folders_of_subjects_beside_their_shapes(tmp_path: Path) 
         write_clip(tmp_path / subject / "walk_poses.npz", np.random.default_rng(0))
         np.savez(tmp_path / subject / "shape.npz", betas=np.zeros(16))
         np.savez(tmp_path / subject / "walk_stagei.npz", betas=np.zeros(16))
+        (tmp_path / subject / "._walk_poses.npz").write_bytes(b"macOS leaves these")
     assert [clip.name for clip in load_clips(tmp_path)] == ["01/walk_poses", "02/walk_poses"]
     assert load_clips(tmp_path / "01" / "walk_poses.npz")[0].name == "walk_poses"
 

@@ -21,14 +21,14 @@ from fsspec.implementations.memory import MemoryFile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_adapters import BagReader
+from msg_adapters import BagReader, BagWriter
 from refu_core import RefuError, SmplFrame
 from refu_core._engine import InProcess, Lost
 from refu_lab.cli import main
 from refu_lab.commands.replay import ReplayOptions
 from refu_lab.fleet import find_recordings, fleet_table, is_plain, open_engine
 from refu_lab.fleet._engine import DaskEngine, FleetError, run_function
-from refu_lab.fleet._storage import fetched
+from refu_lab.fleet._storage import Folder, fetched
 from refu_lab.fleet._summary import FleetResult
 from refu_lab.fleet.replay import _CODE, _content
 from tests.lab import fleet_tasks
@@ -93,6 +93,24 @@ def test_folders_globs_and_urls_stand_for_the_same(bags: Path) -> None:
     assert names(bags / "a" / "walk.mcap") == ["walk"]
     with pytest.raises(RefuError, match="no recording there"):
         names(f"{bags}/*.mcap")
+
+
+def test_what_lies_beside_motions_is_no_recording(tmp_path: Path) -> None:
+    for name in ("walk_poses.npz", "RUN.BVH", "shape.npz", "neutral_stagei.npz", "._walk_poses.npz", ".old.mcap"):
+        (tmp_path / name).touch()
+    assert names(tmp_path) == ["RUN.BVH", "walk_poses"]
+
+
+def test_a_full_disk_is_said_of_the_place_that_was_asked_for(tmp_path: Path) -> None:
+    """Results are written beside their places first, in folders whose names nobody knows."""
+
+    def write() -> None:
+        with Folder(f"{tmp_path}/").scratch() as own:
+            (own / "a" / "b.mcap").mkdir(parents=True)
+            BagWriter(own / "a" / "b.mcap", overwrite=True)
+
+    with pytest.raises(RefuError, match=f"^{tmp_path}/a/b.mcap: can't be written"):
+        write()
 
 
 def test_results_among_the_recordings_are_not_replayed(bags: Path, tmp_path: Path, capsys: Any) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
+from refu_core.simulation._solver import find_candidates
 from refu_lab.interrupts import handled, interruptible, undisturbed
 
 if TYPE_CHECKING:
@@ -74,6 +77,21 @@ def test_where_ctrl_c_is_ignored_it_comes_as_what_interrupts() -> None:
             work(signal.SIGTERM)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_it_comes_during_what_numba_has_compiled() -> None:
+    """Simulated cloth spends its time there; Python made a SystemError of it, and the command called that a bug."""
+    x, faces = np.random.default_rng(0).random((20_000, 3), np.float32), np.arange(3000).reshape(-1, 3)
+    find_candidates(x, faces, x, np.float32(0.01), np.float32(0.05))  # compiles it
+
+    @interruptible()
+    def simulate() -> None:
+        while True:
+            find_candidates(x, faces, x, np.float32(0.01), np.float32(0.05))
+
+    threading.Timer(0.5, signal.raise_signal, (signal.SIGINT,)).start()
+    with pytest.raises(KeyboardInterrupt):
+        simulate()
 
 
 def test_an_alarm_of_the_program_stays() -> None:
