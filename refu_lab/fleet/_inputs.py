@@ -146,7 +146,7 @@ def _named(sources: Collection[str]) -> Iterator[Input]:
         source: path.relative_to(shared) if shared else PurePosixPath(*[part for part in path.parts if part != "/"])
         for source, path in paths.items()
     }
-    bare = {s: r.with_suffix("") if r.suffix in SUFFIXES else r for s, r in short.items()}
+    bare = {s: r.with_suffix("") if r.suffix.lower() in SUFFIXES else r for s, r in short.items()}
     count = Counter(place for name in bare.values() for place in (name, *name.parents))
     for source in sources:
         name = bare[source] if count[bare[source]] == 1 else short[source]
