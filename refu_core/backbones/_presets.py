@@ -208,6 +208,7 @@ def with_dynamics(name: str, network: Backbone, weights: Weights) -> Backbone:
 
 
 def _own(stored: Weights, network: TailorNet, of: str) -> Dynamics:
+    """What `save_dynamics` wrote, for a `network` from the file `of`."""
     config = config_of_card(DynamicsConfig, stored.card.get("config"))
     if not set(config.joints) <= {0, *network.config.joints}:
         msg = f"wanted joints below {N_JOINTS} that the tailornet knows ({network.config.joints}), got {config.joints}"
@@ -217,6 +218,7 @@ def _own(stored: Weights, network: TailorNet, of: str) -> Dynamics:
 
 
 def _carried(stored: Weights, network: TailorNet) -> Dynamics:
+    """What `save_carried_dynamics` wrote."""
     like = stored.card["like"]
     if not isinstance(like, str) or like != Path(like).name:
         raise WeightsError(f"wanted the name of a related garment, got {str(like)[:80]!r}; carry them over anew")

@@ -78,8 +78,8 @@ def train_dynamics(
     """Trains what moving cloth does beyond the garment's tailornet in `folder`, and writes `folder`/dynamics.
 
     All else, and what is returned, is as in `pretrain`; figures stand beside those of the tailornet alone. Raises
-    `RefuError` as that does, and for no set or one of samples at rest; `WeightsError` for no tailornet there, or a
-    damaged one.
+    `RefuError` as that does, and for no set or one of samples at rest; `WeightsError` for no tailornet there, a damaged
+    one, or no dynamics of `like`.
 
     Args:
         datasets: sets of simulated sequences (`refu simulate --sequences`), of plans with different seeds.
