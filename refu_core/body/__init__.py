@@ -24,6 +24,7 @@ from refu_core.body._parts import SEGMENTS as SEGMENTS
 from refu_core.body._parts import joints_of as joints_of
 from refu_core.body._parts import part_of_faces as part_of_faces
 from refu_core.body._parts import weight_of_parts as weight_of_parts
+from refu_core.body._pose_kernels import UP_STEP as UP_STEP
 from refu_core.body._pose_kernels import rodrigues as rodrigues
 from refu_core.body._pose_kernels import up_seen as up_seen
 from refu_core.body._register import Registration as Registration

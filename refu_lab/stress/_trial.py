@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from refu_core._files import replacing
 from refu_core._npz import read_npz
@@ -95,13 +95,16 @@ class Subject:
 
 
 @torch.no_grad()
-def predicted(outfit: Outfit, frames: Sequence[SmplFrame]) -> list[NDArray[np.floating]]:
+def predicted(
+    outfit: Outfit, frames: Sequence[SmplFrame], *, up: ArrayLike = (0.0, 1.0, 0.0)
+) -> list[NDArray[np.floating]]:
     """Bodies, then garments before collision handling, in the outfit's precision: B frames [m], (B, V, 3) each."""
     none = np.zeros(N_STYLES, np.float32)
     columns = zip(*((f.pose, f.betas, none if f.style is None else f.style) for f in frames), strict=True)
     pose, betas, style = (torch.as_tensor(np.stack(one)).to(outfit.body.v_template.dtype) for one in columns)
     wearer = Wearer.of(outfit, betas, style if any(frame.style is not None for frame in frames) else None)
-    dressed = dress(pose, wearer, past=torch.as_tensor(pasts_of(frames)).to(pose.dtype))
+    past = torch.as_tensor(pasts_of(frames)).to(pose.dtype)
+    dressed = dress(pose, wearer, past=past, up=torch.as_tensor(np.tile(up, (len(pose), 1))).to(pose.dtype))
     return [
         torch.stack([turn(one) for turn, one in zip(dressed.turns, found, strict=True)]).numpy()
         for found in (dressed.body, *(drape.vertices for drape in dressed.drapes.values()))
