@@ -303,7 +303,7 @@ class SmplBody:
 
         Raises `FrameError` for anything but such a tensor.
         """
-        require_batch("pose", pose, (N_JOINTS, 3))
+        require_batch("the pose's rotation vectors", pose, (N_JOINTS, 3))
         rotations = rotvec_to_rotmat(pose)
         joints, transforms = forward_kinematics(rotations, shape.joints)
         vertices = shape.vertices

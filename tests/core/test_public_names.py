@@ -121,8 +121,8 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
             lambda: query_batch(posed(), CORNERS[None], CORNERS),
             r"wanted points of 1 bodies, .*, got the shape \(4, 3\)",
         ),
-        (lambda: Refu(3, least="1"), "wanted a least α, 0 or 1, got str"),
-        (lambda: Refu(3, least=np.nan), "wanted a least α of 0 or 1, got nan"),
+        (lambda: Refu(3, least="1"), "wanted a least scale of 0 to 1, got str"),
+        (lambda: Refu(3, least=np.nan), "a least scale of 0 to 1, got 0.004 m and nan"),
         *(
             (lambda given=given: Refu(3, least=1.0).feature(*given), said)
             for given, said in (
