@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from refu_core.backbones import SEEN_TILT
 from refu_core.body import SmplBody
 from refu_core.errors import FrameError, MeshError, WeightsError
-from refu_core.frames import N_JOINTS, SmplFrame
+from refu_core.frames import LAGS, N_JOINTS, SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.keypoints._pose import skew
 from refu_core.outputs._worn import require_worn
@@ -78,7 +78,8 @@ def turned_of(garment: GarmentTemplate, past: NDArray[Any]) -> float:
 
     `past` is `SmplFrame.past`, (4, 219).
     """
-    of_joints = past[2, : 9 * N_JOINTS].reshape(N_JOINTS, 9)[[0, *(j for j in garment.card.joints if j != 0)]]
+    joints = [0, *(joint for joint in garment.card.joints if joint != 0)]
+    of_joints = past[LAGS.index(4 / 15), : 9 * N_JOINTS].reshape(N_JOINTS, 9)[joints]
     return float(np.linalg.norm(of_joints) / np.sqrt(2))  # |R - R'| of small turns is √2 times their angle
 
 
