@@ -122,7 +122,7 @@ class Track:
         return len(self._rows) // _NUMBERS
 
     def add(self, frame: SmplFrame) -> None:
-        longest = np.linalg.norm(frame.pose, axis=1).max()
+        longest = float(np.linalg.norm(frame.pose, axis=1).max())
         self._rows.extend((longest, 1e-9 * frame.stamp_ns, *frame.pose[0], *frame.transl))
 
     def doubts(self, *, is_y_up: bool) -> dict[str, str]:

@@ -189,8 +189,8 @@ def vertex_normals(vertices: NDArray[_Float], faces: NDArray[np.integer[Any]]) -
     """Unit normals at vertices (V, 3) of faces (F, 3): the area-weighted mean of faces around each, shape (V, 3)."""
     normals = np.zeros_like(vertices)
     np.add.at(normals, faces, face_normals(vertices, faces)[:, None])
-    unit: NDArray[_Float] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    return unit
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    return normals
 
 
 def vertex_areas(vertices: NDArray[np.floating[Any]], faces: NDArray[np.integer[Any]]) -> NDArray[np.float64]:

@@ -126,7 +126,7 @@ class BodyArrays:
         )
         if arrays.faces.min(initial=0) < 0 or arrays.faces.max(initial=0) >= n:
             msg = f"{source}: faces must index {n} vertices, got {arrays.faces.min()} to {arrays.faces.max()}"
-            if (arrays.faces.min(), arrays.faces.max()) == (1, n):
+            if arrays.faces.min() == 1 and arrays.faces.max() == n:
                 msg += ": they count from 1, wanted from 0; subtract 1"
             raise BodyError(msg)
         sums, least = arrays.weights.sum(1), arrays.weights.min()

@@ -147,8 +147,8 @@ def fits_of(points: F64, normals: F64, area: F64, samples: Samples, body: PosedB
     # the body and one that faces away from it, and little that faces anything else.
     pieces, n_pieces = samples.piece[samples.is_open], int(samples.piece.max()) + 1
     at_each = pieces + n_pieces * np.arange(n_places)[:, None]
-    votes = np.bincount(at_each.ravel(), is_outer[:, samples.is_open].ravel(), n_places * n_pieces)
-    votes, all_votes = votes.reshape(n_places, n_pieces), np.bincount(pieces, minlength=n_pieces)
+    outer = np.bincount(at_each.ravel(), is_outer[:, samples.is_open].ravel(), n_places * n_pieces)
+    votes, all_votes = outer.reshape(n_places, n_pieces), np.bincount(pieces, minlength=n_pieces)
     n_facing = np.maximum(votes, all_votes - votes).sum(1) + (np.abs(outward[:, ~samples.is_open]) > _ACROSS).sum(1)
     figures = zip(
         (distance < -0.01).mean(1).tolist(),

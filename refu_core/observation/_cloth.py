@@ -284,7 +284,7 @@ class ObservedCloth:
         return slopes
 
 
-def within(points: NDArray[np.floating], low: F32, high: F32) -> NDArray[np.bool_]:
+def within(points: NDArray[np.floating], low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which of the points (N, 3) are in a box."""
     inside = np.ones(len(points), np.bool_)
     for values, least, most in zip(points.T, low, high, strict=True):

@@ -66,7 +66,7 @@ def within_promise(frame: SmplFrame, style: Sequence[float] | NDArray[np.floatin
     The promise has one more condition, which only the posed body can tell: `FrameStats.within_promise`.
     """
     low, high = PROMISED_POSES
-    pose = frame.pose
+    pose: NDArray[np.floating] = frame.pose
     if ((pose < low) | (pose > high)).any():  # unless another vector of the same rotation is within
         angle = np.linalg.norm(pose.astype(np.float64), axis=1, keepdims=True)
         turns = np.round(angle / (2 * np.pi))

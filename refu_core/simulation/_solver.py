@@ -53,30 +53,30 @@ def substep(
     shortest: _Floats,  # between these two lengths a constraint gives way freely (E,)
     longest: _Floats,
     softness: _Floats,  # compliance over h² (E,)
-    h: float,
+    h: np.float32,
     gravity: _Floats,  # (3,)
-    damping: float,
+    damping: np.float32,
     contact_vertex: _Ints,  # (C,)
     contact_point: _Floats,  # (C, 3), advanced by contact_motion once
     contact_normal: _Floats,  # (C, 3)
     contact_motion: _Floats,  # motion of the skin in this substep (C, 3)
-    margin: float,
-    friction: float,
+    margin: np.float32,
+    friction: np.float32,
     anchor_vertex: _Ints,  # (A,)
     anchor_point: _Floats,  # (A, 3), advanced by anchor_motion once
     anchor_motion: _Floats,  # (A, 3)
-    anchor_stiffness: float,  # share of the way to the anchor closed by an iteration
+    anchor_stiffness: np.float32,  # share of the way to the anchor closed by an iteration
     pair_vertex: _Ints,  # self-contacts (S,)
     pair_face: _Ints,  # (S, 3) vertices
     pair_side: _Floats,  # (S,) side of the face that the vertex was on when the pair was found
-    thickness: float,
+    thickness: np.float32,
     edge_ends: _Ints,  # contacts of edge midpoints (M, 2)
     edge_point: _Floats,  # (M, 3), advanced by edge_motion once
     edge_normal: _Floats,  # (M, 3)
     edge_motion: _Floats,  # (M, 3)
-    edge_margin: float,
+    edge_margin: np.float32,
     iterations: int,
-    max_step: float,  # no vertex moves further in one substep; keeps a bad contact from throwing the cloth away
+    max_step: np.float32,  # no vertex moves further in one substep; keeps a bad contact from throwing the cloth away
 ) -> None:
     one = np.float32(1.0)
     half = np.float32(0.5)
@@ -155,7 +155,7 @@ def substep(
 
 @numba.njit(cache=True, fastmath=True)
 def _separate_pairs(
-    x: _Floats, inverse_mass: _Floats, pair_vertex: _Ints, pair_face: _Ints, pair_side: _Floats, thickness: float
+    x: _Floats, inverse_mass: _Floats, pair_vertex: _Ints, pair_face: _Ints, pair_side: _Floats, thickness: np.float32
 ) -> None:
     """Pushes a vertex and a face of the cloth apart to `thickness`, on the side where the vertex was found."""
     one = np.float32(1.0)
@@ -200,7 +200,7 @@ def refresh_points(
     body: _Floats,
     motion: _Floats,
     moving: bool,
-    near: float,
+    near: np.float32,
 ) -> tuple[_Ints, _Floats, _Floats, _Floats]:
     """Contacts of the points near the skin: index of the point, place on the skin, its normal, its motion in a substep.
 
@@ -240,7 +240,9 @@ def refresh_points(
 
 
 @numba.njit(cache=True, fastmath=True)
-def _is_candidate(x: _Floats, rest: _Floats, i: int, here: _Floats, s: int, near2: float, apart2: float) -> np.bool_:
+def _is_candidate(
+    x: _Floats, rest: _Floats, i: int, here: _Floats, s: int, near2: np.float32, apart2: np.float32
+) -> np.bool_:
     """Whether a face is near vertex i, and apart at rest; column s of `here` (6, F) has its centre, now and at rest."""
     p = (x[i, 0] - here[0, s], x[i, 1] - here[1, s], x[i, 2] - here[2, s])
     q = (rest[i, 0] - here[3, s], rest[i, 1] - here[4, s], rest[i, 2] - here[5, s])
@@ -248,7 +250,9 @@ def _is_candidate(x: _Floats, rest: _Floats, i: int, here: _Floats, s: int, near
 
 
 @numba.njit(cache=True, fastmath=True)
-def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, cell: float) -> tuple[_Ints, _Ints]:
+def find_candidates(
+    x: _Floats, faces: _Ints, rest: _Floats, rest_apart: np.float32, cell: np.float32
+) -> tuple[_Ints, _Ints]:
     """Pairs of a vertex and a face whose centre is at most `cell` away, and at least `rest_apart` in the rest shape.
 
     Faces are binned by their centres in a grid of cells of that size. Returns vertices and faces, (C,) each, by vertex.
@@ -320,7 +324,7 @@ def find_candidates(x: _Floats, faces: _Ints, rest: _Floats, rest_apart: float, 
 
 
 @numba.njit(cache=True, fastmath=True)
-def near_pairs(x: _Floats, faces: _Ints, vertex: _Ints, face: _Ints, reach: float) -> tuple[_Ints, _Ints, _Floats]:
+def near_pairs(x: _Floats, faces: _Ints, vertex: _Ints, face: _Ints, reach: np.float32) -> tuple[_Ints, _Ints, _Floats]:
     """The candidates (C,) whose vertex is within `reach` of the plane of its face.
 
     Returns the vertex (S,), the face's vertices (S, 3) and the side of the face that the vertex is on (S,), by vertex.
