@@ -70,7 +70,7 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
         axes: axes of the files' roots; `auto` infers them from how people stand, and says so in `Clip.notes`.
         fps: frames a second, instead of what the files say.
 
-    Raises `SimulationError` for nothing there, or a file of another layout.
+    Raises `SimulationError` for nothing there, or for files of another layout, all of which it names.
     """
     path = Path(path)
     files = [path]
@@ -78,13 +78,21 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
         files = sorted(file for file in path.rglob("*") if is_named_as_motion(file.name))
     if not files or not files[0].exists():
         raise SimulationError(f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder or a file")
-    clips, folder = [], path if path.is_dir() else path.parent
+    clips, unfit, folder = [], [], path if path.is_dir() else path.parent
     for file in files:
-        found = read_recording(file, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
-        if not (np.isfinite(found.poses).all() and np.isfinite(found.transl).all()):
-            raise SimulationError(f"{file}: wanted finite poses and trans; cut out the frames that aren't")
         name = file.relative_to(folder).with_suffix("").as_posix()
-        clips.append(Clip(name, found.poses, found.transl, found.fps, found.notes))
+        try:
+            found = read_recording(file, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
+            if not (np.isfinite(found.poses).all() and np.isfinite(found.transl).all()):
+                raise SimulationError(f"{file}: wanted finite poses and trans; cut out the frames that aren't")
+        except SimulationError as error:
+            unfit.append((file.name, error))
+        else:
+            clips.append(Clip(name, found.poses, found.transl, found.fps, found.notes))
+    if unfit:
+        (_, first), *others = unfit
+        nor = ", ".join([name for name, _ in others[:3]] + ["…"] * (len(others) > 3))
+        raise SimulationError(f"{first}; nor can these be used: {nor}" if others else str(first)) from first
     return clips
 
 

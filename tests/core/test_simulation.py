@@ -672,6 +672,21 @@ def test_motions_lie_in_folders_of_subjects_beside_their_shapes(tmp_path: Path) 
     assert load_clips(tmp_path / "01" / "walk_poses.npz")[0].name == "walk_poses"
 
 
+def test_all_motions_that_can_not_be_used_are_named_at_once(tmp_path: Path) -> None:
+    for name in ("a", "b", "c", "d", "e", "f"):
+        write_clip(tmp_path / f"{name}.npz", np.random.default_rng(0))
+    (tmp_path / "b.npz").write_bytes(b"cut off")
+    with pytest.raises(SimulationError, match=r"b\.npz: (?!.*nor)"):
+        load_clips(tmp_path)
+    np.savez(tmp_path / "d.npz", poses=np.full((5, 72), np.nan), trans=np.zeros((5, 3)))
+    with pytest.raises(SimulationError, match=r"b\.npz: .*; nor can these be used: d\.npz$"):
+        load_clips(tmp_path)
+    for name in "cef":
+        (tmp_path / f"{name}.npz").write_bytes(b"")
+    with pytest.raises(SimulationError, match=r"; nor can these be used: c\.npz, d\.npz, e\.npz, …$"):
+        load_clips(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("replaced", "match"),
     [
