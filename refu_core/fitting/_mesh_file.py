@@ -105,7 +105,8 @@ def read_surface(path: str | os.PathLike[str]) -> SurfaceMesh:
     except ImportError:
         raise
     except Exception as error:  # trimesh may raise anything for a damaged file
-        raise GarmentError(f"{source}: not a mesh that can be read: {error or type(error).__name__}") from error
+        msg = f"{source}: not a mesh that can be read ({error or type(error).__name__}): export it again"
+        raise GarmentError(msg) from error
     return mesh
 
 
