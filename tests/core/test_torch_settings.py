@@ -82,6 +82,7 @@ def test_a_forward_pass_gives_the_same_in_inference_mode_and_nothing_for_nobody(
         assert none[name].vertices.shape == tracked[name].vertices.shape == (0, *drape.vertices.shape[1:])
 
 
+@pytest.mark.filterwarnings("ignore:Guards may run slower on Python 3.13.0:RuntimeWarning")
 def test_a_forward_pass_can_be_compiled() -> None:
     outfit = GarmentPipeline.load(["tshirt-male"], collider=False).outfit
     pose, betas = 0.1 * torch.ones(2, 24, 3), torch.ones(2, 10)

@@ -65,7 +65,7 @@ def fill(_: Any) -> None:
 
 
 def call(_: Any) -> None:
-    subprocess.run([sys.executable, "-c", ""], check=False)
+    subprocess.run([sys.executable, "-c", ""], check=False, start_new_session=True)  # from 3.13 on it spawns otherwise
 
 
 def write(_: Any) -> None:
