@@ -243,8 +243,7 @@ def _sides(f: Ints, pairs: Ints) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     a, b = (pairs // 3).T
     first = np.unique(linked(pairs // 3, n)[1], return_index=True)[1]
     _, once = np.unique(np.minimum(a, b) * n + np.maximum(a, b), return_index=True)
-    ends = a[once].astype(np.int32), b[once].astype(np.int32)  # of 64 bits, SciPy 1.12 can't search them
-    graph = coo_array((np.where(agrees, 1.0, n)[once], ends), shape=(n, n)).tocsr()
+    graph = coo_array((np.where(agrees, 1.0, n)[once], (a[once], b[once])), shape=(n, n)).tocsr()
     ways: Any = dijkstra(graph, False, first, return_predecessors=True, min_only=True)
     tree = once[(ways[1][a[once]] == b[once]) | (ways[1][b[once]] == a[once])]
     # Each face is there twice, as it is (k) and turned over (n + k), and linked to neighbours that face the same way.
