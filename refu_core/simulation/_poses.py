@@ -19,6 +19,8 @@ from refu_core.skeleton import JOINT_NAMES, posed
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
 # is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,
 # an arm lowered by a negative turn about z, an elbow bent by a negative turn about y.
+_SHOWN = 3
+"""How many files an error lists beside the first one."""
 _LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     0: ((-15, 25), (0, 0), (-10, 10)),
     1: ((-85, 20), (-20, 20), (-5, 25)),
@@ -78,21 +80,23 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
         files = sorted(file for file in path.rglob("*") if is_named_as_motion(file.name))
     if not files or not files[0].exists():
         raise SimulationError(f"{path}: wanted motions ({', '.join(SUFFIXES)}), found none; give a folder or a file")
-    clips, unfit, folder = [], [], path if path.is_dir() else path.parent
+    clips, unfit, folder = [], {}, path if path.is_dir() else path.parent
     for file in files:
-        name = file.relative_to(folder).with_suffix("").as_posix()
+        name = file.relative_to(folder)
         try:
             found = read_recording(file, error=SimulationError, axes="z-up" if axes == "frame" else axes, fps=fps)
             if not (np.isfinite(found.poses).all() and np.isfinite(found.transl).all()):
                 raise SimulationError(f"{file}: wanted finite poses and trans; cut out the frames that aren't")
         except SimulationError as error:
-            unfit.append((file.name, error))
+            unfit[name.as_posix()] = error
         else:
-            clips.append(Clip(name, found.poses, found.transl, found.fps, found.notes))
+            clips.append(Clip(name.with_suffix("").as_posix(), found.poses, found.transl, found.fps, found.notes))
     if unfit:
-        (_, first), *others = unfit
-        nor = ", ".join([name for name, _ in others[:3]] + ["…"] * (len(others) > 3))
-        raise SimulationError(f"{first}; nor can these be used: {nor}" if others else str(first)) from first
+        first, others = next(iter(unfit.values())), [*unfit][1:]
+        if not others:
+            raise first
+        listing = ", ".join(others[:_SHOWN]) + (", …" if len(others) > _SHOWN else "")
+        raise SimulationError(f"{first}; nor can these be used: {listing}") from first
     return clips
 
 

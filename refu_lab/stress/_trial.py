@@ -98,7 +98,10 @@ class Subject:
 def predicted(
     outfit: Outfit, frames: Sequence[SmplFrame], *, up: ArrayLike = (0.0, 1.0, 0.0)
 ) -> list[NDArray[np.floating]]:
-    """Bodies, then garments before collision handling, in the outfit's precision: B frames [m], (B, V, 3) each."""
+    """Bodies, then garments before collision handling, in the outfit's precision: B frames [m], (B, V, 3) each.
+
+    `up` is what `dress` takes, for every person.
+    """
     none = np.zeros(N_STYLES, np.float32)
     columns = zip(*((f.pose, f.betas, none if f.style is None else f.style) for f in frames), strict=True)
     pose, betas, style = (torch.as_tensor(np.stack(one)).to(outfit.body.v_template.dtype) for one in columns)

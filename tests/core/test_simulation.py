@@ -685,6 +685,11 @@ def test_all_motions_that_can_not_be_used_are_named_at_once(tmp_path: Path) -> N
         (tmp_path / f"{name}.npz").write_bytes(b"")
     with pytest.raises(SimulationError, match=r"; nor can these be used: c\.npz, d\.npz, e\.npz, …$"):
         load_clips(tmp_path)
+    for name in ("01/walk.npz", "02/walk.npz"):
+        (tmp_path / "subjects" / name).parent.mkdir(parents=True)
+        (tmp_path / "subjects" / name).write_bytes(b"")
+    with pytest.raises(SimulationError, match=r"01/walk\.npz: .*; nor can these be used: 02/walk\.npz$"):
+        load_clips(tmp_path / "subjects")
 
 
 @pytest.mark.parametrize(
