@@ -50,19 +50,19 @@ def _train(
     template, body = worn_on(template, fit), fit.body
     steps: dict[str, Any] = {} if options.steps is None else {"steps": options.steps}
     common: dict[str, Any] = {"device": options.device, "quiet": not progress}
-    dataset = datasets[0]
     if options.network == "sdf":
+        dataset = datasets[0]
         assert isinstance(dataset, GarmentDataset)  # `train` has opened it as one
         to_sdf = replace(training.SdfSettings.of(options.preset), seed=options.seed, **steps)
         return training.train_sdf(dataset, body, template, options.folder, settings=to_sdf, **common)
     common["body"] = body
-    given = template, dataset, options.folder
+    given = template, datasets, options.folder
     motions = options.motions and load_clips(options.motions, axes=options.input_axes, fps=options.fps)
     rehearsal = None if options.rehearse is None else training.Rehearsal(options.rehearse, motions)
     if options.network == "dynamics":
         common |= {"mode": options.mode, "like": options.like}
         moving = _seeded(training.DynamicsSettings(), options, **steps)
-        return training.train_dynamics(template, datasets, options.folder, settings=moving, **common)
+        return training.train_dynamics(*given, settings=moving, **common)
     if options.network in KINDS:
         assert rehearsal is not None  # `_check` has seen to it
         beyond = _seeded(training.BeyondSettings(), options, **steps)
@@ -73,7 +73,8 @@ def _train(
         return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
     common |= {"backbone": options.backbone, "preset": options.preset}
     of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
-    first = training.PretrainSettings.of(options.backbone, options.preset, samples=int(dataset.train.sum()))
+    count = sum(int(one.train.sum()) for one in datasets)
+    first = training.PretrainSettings.of(options.backbone, options.preset, samples=count)
     first = _seeded(first, options, **of_all)
     if options.start is not None:
         common |= {"start": options.start, "mode": options.mode, "joints": _numbers(options.joints)}
@@ -89,7 +90,7 @@ def _train(
     changes |= {} if options.margin is None else {"margin": options.margin}
     changes |= {"is_blended": False} if options.unblended else {}
     last = _seeded(training.FinetuneSettings.of(options.backbone, options.preset), options, **changes, **steps)
-    return training.finetune(template, dataset, source, options.folder, mode=options.mode, settings=last, **common)
+    return training.finetune(template, datasets, source, options.folder, mode=options.mode, settings=last, **common)
 
 
 def _check(options: TrainOptions) -> None:
@@ -99,9 +100,7 @@ def _check(options: TrainOptions) -> None:
     is_changed = changed != ("vertex", None, False, "garment", "realtime")
     presets = SDF_PRESETS if options.network == "sdf" else PRESETS
     refused = {
-        "several sets of --data are for --network dynamics: give one": (
-            len(options.data) > 1 and options.network != "dynamics"
-        ),
+        "the distance's network learns from one set of --data": len(options.data) > 1 and options.network == "sdf",
         "--like makes a tailornet of the preset realtime, or dynamics: leave --backbone, --preset and others out": (
             options.like is not None and options.network != "dynamics" and not is_plain
         ),

@@ -13,7 +13,6 @@ from refu_core import backbones as nets
 from refu_core.body import SmplBody
 from refu_core.errors import RefuError, printable
 from refu_core.garments import GarmentTemplate
-from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._pretrain import code_loss
@@ -35,7 +34,7 @@ class BeyondSettings:
 def train_beyond(
     kind: str,
     garment: str | GarmentTemplate,
-    dataset: str | Path | GarmentDataset | GarmentSequences,
+    datasets: data.Sets,
     folder: str | Path,
     *,
     rehearsal: Rehearsal,
@@ -63,9 +62,9 @@ def train_beyond(
     def who(pose: Tensor) -> Tensor:
         return nets.KINDS[kind].share(pose) > 0
 
-    opened = data.TrainingSet.of(garment, dataset, body, who=who)
+    opened = data.TrainingSet.of(garment, datasets, body, who=who)
     template, body, folder = opened.garment, opened.body, Path(folder)
-    test = data.read_samples(opened.rows, body, template, split="test", who=who)
+    test = opened.test(who=who)
     samples = opened.samples
     if not len(samples) or not len(test):
         msg = f"wanted people of the kind {kind} to learn from and to test on, the set of {template.name} has "
@@ -82,7 +81,7 @@ def train_beyond(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         beyond = nets.Beyond(kind, nets.BeyondConfig(known.config.joints), decoder)
-    rehearsed = rehearsal.of(card_of_known, known, known=opened.card["plan"])
+    rehearsed = rehearsal.of(card_of_known, known, known=[one["plan"] for one in opened.cards])
     rehearsed = rehearsed.take(who(rehearsed.pose))
     owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
     parts = [
@@ -103,7 +102,7 @@ def train_beyond(
     beyond.to("cpu").eval()
     both: dict[str, nets.Backbone] = {"mpve_mm": nets.WithBeyond(known, [beyond]), "without_mm": known}
     figures = {name: data.mpve(data.displacements(one, test), test, body, template) for name, one in both.items()}
-    card = {**described, "dataset": opened.card, "figures": {"samples": len(test), **figures}}
+    card = {**described, "datasets": opened.cards, "figures": {"samples": len(test), **figures}}
     if is_writer():
         nets.save_beyond(folder, beyond, card)
         loop.checkpoint.unlink(missing_ok=True)

@@ -23,7 +23,7 @@ from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS
 from refu_core.garments import N_STYLES, GarmentTemplate, load_garment, worn_on
 from refu_core.modes import SdfMode
-from refu_core.simulation import GarmentDataset, GarmentSequences, random_pose
+from refu_core.simulation import random_pose
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
 from refu_core.training._pretrain import code_loss
@@ -130,7 +130,7 @@ def _from_rim(garment: GarmentTemplate, points: NDArray[np.float64]) -> NDArray[
 
 def carry_over(
     garment: str | GarmentTemplate,
-    dataset: str | Path | GarmentDataset | GarmentSequences,
+    datasets: data.Sets,
     output: str | Path,
     *,
     like: str,
@@ -146,9 +146,9 @@ def carry_over(
     """
     settings, output = settings or CarrySettings(), Path(output)
     nets.require_basis(output, None, written=[f"tailornet-{mode}" for mode in SdfMode])
-    opened = data.TrainingSet.of(garment, dataset, body)
+    opened = data.TrainingSet.of(garment, datasets, body)
     template, body = opened.garment, opened.body
-    test = data.read_samples(opened.rows, body, template, split="test")
+    test = opened.test()
     carried = Carried(load_garment(like), template, body, settings)
     samples = data.with_mirrored(opened.samples, data.Mirror.of(template))
     controls = nets.Controls.spread(template, settings.controls)
@@ -159,7 +159,7 @@ def carry_over(
     there = share * carried(*(values[: len(samples)] for values in drawn))
     basis = _smooth_basis(torch.cat((samples.displacement, there)), controls, settings.rank)
     described = {**opened.identity, "samples": len(samples), "simulated": len(opened.samples), "like": like}
-    nets.save_basis(output, basis, {**described, "set": len(opened.rows)})
+    nets.save_basis(output, basis, {**described, "set": opened.n_slots})
 
     config = nets.TailorNetConfig(template.card.joints, low=settings.hidden, high=(), style_shape=(), dropout=0.0)
     with torch.random.fork_rng(devices=[]):
@@ -190,7 +190,7 @@ def carry_over(
         "backbone": "tailornet",
         "preset": "realtime",
         "settings": asdict(settings),
-        "dataset": opened.card,
+        "datasets": opened.cards,
         "figures": {
             **data.backbone_figures(model, test, body, template, mean=samples.displacement.mean(0)),
             "carried_mm": data.mpve(carried(test.betas, test.pose), test, body, template),

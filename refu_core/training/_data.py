@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -117,29 +117,39 @@ class TrainingSamples:
         return TrainingSamples(*(torch.cat([getattr(one, f.name) for one in (self, *others)]) for f in fields(self)))
 
 
+Rows = GarmentDataset | GarmentSequences
+Sets = str | Path | Rows | Sequence[str | Path | Rows]
+"""A simulated set, or several of plans with different seeds: each is open, or the path of one."""
+
+
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
-    """A simulated set, its garment and body, and the samples of its training split."""
+    """Simulated sets of a garment on a body, and the samples of their training splits."""
 
     garment: GarmentTemplate
     body: SmplBody
-    rows: GarmentDataset | GarmentSequences
+    sets: Sequence[Rows]
     samples: TrainingSamples
 
     @classmethod
     def of(
         cls,
         garment: str | GarmentTemplate,
-        dataset: str | Path | GarmentDataset | GarmentSequences,
+        datasets: Sets,
         body: SmplBody | None,
         *,
         who: Callable[[Tensor], Tensor] | None = None,
     ) -> TrainingSet:
-        """Opens a set; the body is the garment's own if not given. Raises `RefuError` as `read_samples`."""
+        """Opens sets; the body is the garment's own if not given. Raises `RefuError` as `split`."""
         template = load_garment(garment) if isinstance(garment, str) else garment
         body = load_body(template.body) if body is None else body
-        rows = open_dataset(dataset) if isinstance(dataset, (str, Path)) else dataset
-        return cls(template, body, rows, read_samples(rows, body, template, split="train", who=who))
+        given = datasets if isinstance(datasets, Sequence) and not isinstance(datasets, str) else [datasets]
+        sets = [open_dataset(one) if isinstance(one, (str, Path)) else one for one in given]
+        return cls(template, body, sets, _joined(sets, body, template, "train", who))
+
+    def test(self, *, who: Callable[[Tensor], Tensor] | None = None) -> TrainingSamples:
+        """The samples of the sets' test splits. Raises `RefuError` as `read_samples`."""
+        return _joined(self.sets, self.body, self.garment, "test", who)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -147,9 +157,10 @@ class TrainingSet:
         return {"garment": self.garment.name, "body_fingerprint": self.body.fingerprint}
 
     @property
-    def card(self) -> dict[str, Any]:
-        """What the card of the weights says about the set."""
-        return {key: self.rows.card.get(key) for key in ("garment_fingerprint", "motions_fingerprint", "plan")}
+    def cards(self) -> list[dict[str, Any]]:
+        """What the card of the weights says about each set."""
+        keys = "garment_fingerprint", "motions_fingerprint", "plan"
+        return [{key: one.card.get(key) for key in keys} for one in self.sets]
 
     def tailornet(self, folder: Path, mode: str) -> tuple[TailorNet, Mapping[str, Any]]:
         """The garment's trained tailornet in `folder`, and its card.
@@ -163,9 +174,14 @@ class TrainingSet:
         return found, stored.card
 
     @property
+    def n_slots(self) -> int:
+        """Rows of all sets, finished or not."""
+        return sum(map(len, self.sets))
+
+    @property
     def n_pivots(self) -> int:
-        """How many pairs of the plan have many poses each. Raises `RefuError` for a card without a valid number."""
-        found = self.rows.card["plan"].get("pivots", SamplePlan.pivots)
+        """How many pairs of the first plan have many poses each. Raises `RefuError` where its card doesn't say."""
+        found = self.sets[0].card["plan"].get("pivots", SamplePlan.pivots)
         if not isinstance(found, int) or found < 1:
             raise RefuError(f"wanted the number of its pivots in the set's card (plan.pivots), got {str(found)[:80]}")
         return found
@@ -173,7 +189,7 @@ class TrainingSet:
     @property
     def knows_limbs(self) -> bool:
         """Whether limbs beside cloth were simulated where recorded: old sets, without colliders, held limbs back."""
-        return "gap" in self.rows.card.get("settings", {}).get("drape", {})
+        return all("gap" in one.card.get("settings", {}).get("drape", {}) for one in self.sets)
 
 
 class TakenAlong:
@@ -201,7 +217,7 @@ def in_chunks(of: Callable[..., Tensor], *values: Any, size: int = 64) -> Tensor
 
 
 def read_samples(
-    dataset: GarmentDataset | GarmentSequences,
+    dataset: Rows,
     body: SmplBody,
     garment: GarmentTemplate,
     *,
@@ -236,6 +252,28 @@ def read_samples(
     with torch.no_grad():
         found = in_chunks(displacement, vertices, pose, betas, style)
     return TrainingSamples(pose, betas, style, found, pair.long())
+
+
+def _joined(
+    sets: Sequence[Rows],
+    body: SmplBody,
+    garment: GarmentTemplate,
+    split: str,
+    who: Callable[[Tensor], Tensor] | None,
+) -> TrainingSamples:
+    """The samples of a split of all sets, any of which may lack it; each pair keeps a number of its own."""
+    if not sets:
+        raise RefuError(f"wanted a set of {garment.name}, got none: refu simulate {garment.name} makes one")
+    for one in sets:
+        check_set(one, body, garment)
+    having = [one for one in sets if (one.train if split == "train" else one.test).any()] or sets[:1]
+    numbered, count = [], 0
+    for one in having:
+        samples = read_samples(one, body, garment, split=split, who=who)
+        numbered.append(replace(samples, pair=samples.pair + count))
+        count += int(samples.pair.max()) + 1 if len(samples) else 0
+    first, *others = numbered
+    return first.joined(*others) if others else first
 
 
 def _frames(dataset: GarmentSequences, rows: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
@@ -304,7 +342,7 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     return mean, components[:, :rank].T.contiguous()
 
 
-def check_set(dataset: GarmentDataset | GarmentSequences, body: SmplBody, garment: GarmentTemplate) -> None:
+def check_set(dataset: Rows, body: SmplBody, garment: GarmentTemplate) -> None:
     """Raises `RefuError` for a set that wasn't simulated for this garment on this body."""
     for what, wanted, of_set in (
         ("garment", garment.name, dataset.parts),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -89,17 +89,13 @@ def train_dynamics(
         like: a related garment whose dynamics ship: what they know is carried over first, and learning goes on there.
     """
     template, folder = load_garment(garment) if isinstance(garment, str) else garment, Path(folder)
-    opened = [data.TrainingSet.of(template, dataset, body) for dataset in datasets]
-    sets = [one.rows for one in opened if isinstance(one.rows, GarmentSequences)]
-    if not sets or len(sets) < len(opened):
-        got = "samples at rest" if opened else "no set"
-        raise RefuError(f"dynamics need sequences, got {got}: refu simulate {template.name} --sequences makes them")
-    body = opened[0].body
-    # Sets of synthetic motions may be for training alone. Where no set is for the test, that is said before any work.
-    tested = [rows for rows in sets if rows.test.any()] or sets
-    test = _joined(data.read_samples(rows, body, template, split="test") for rows in tested)
-    samples = _joined(one.samples for one in opened)
-    still, card_of_still = opened[0].tailornet(folder, mode)
+    opened = data.TrainingSet.of(template, datasets, body)
+    sets = [one for one in opened.sets if isinstance(one, GarmentSequences)]
+    if len(sets) < len(opened.sets):
+        raise RefuError(f"dynamics need sequences, got samples at rest: refu simulate {template.name} --sequences")
+    body, samples = opened.body, opened.samples
+    test = opened.test()  # where no set is for the test, that is said before any work
+    still, card_of_still = opened.tailornet(folder, mode)
     settings = settings or DynamicsSettings()
     torch_device = start_parallel(device)
     if like is None:
@@ -118,7 +114,7 @@ def train_dynamics(
     if like is None:
         dynamics.standardise(*train[:3], still.features.are_bounded(template))
     described = {
-        **opened[0].identity,
+        **opened.identity,
         "mode": mode,
         **({} if like is None else {"start": like}),
         "tailornet_sha256": card_of_still["sha256"],
@@ -138,7 +134,7 @@ def train_dynamics(
     loop.run(TrainingStage("dynamics", objective, settings.steps, train, validation))
     dynamics.to("cpu").eval()
     figures = _figures(still, dynamics, test, _prepared(still, test, _pasts(sets, "test")), body, template)
-    card = {**described, "datasets": [one.card for one in opened], "figures": figures}
+    card = {**described, "datasets": opened.cards, "figures": figures}
     if is_writer():
         save_dynamics(folder, dynamics, card)
         loop.checkpoint.unlink(missing_ok=True)
@@ -156,16 +152,6 @@ def _carried(
     here, controls = carried(samples.betas, samples.pose), Controls.spread(garment, settings.controls)
     share = borne_out(here, samples.displacement, controls)
     return carried_dynamics(like, own_codes(carried, share[:, None], like, still.decoder), still)
-
-
-def _joined(sets: Iterable[data.TrainingSamples]) -> data.TrainingSamples:
-    """The samples of all sets; each sequence keeps a number of its own."""
-    first, *others = sets
-    numbered, count = [], int(first.pair.max()) + 1
-    for other in others:
-        numbered.append(replace(other, pair=other.pair + count))
-        count += int(other.pair.max()) + 1
-    return first.joined(*numbered)
 
 
 def _pasts(sets: Sequence[GarmentSequences], split: str, *, is_mirrored: bool = False) -> Tensor:

@@ -15,7 +15,6 @@ from refu_core.errors import RefuError
 from refu_core.garments import GarmentTemplate
 from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_tensors
-from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training import _data as data
 from refu_core.training._dresser import Dresser, Sdf, refu_loss
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
@@ -76,7 +75,7 @@ class FinetuneSettings:
 
 def finetune(
     garment: str | GarmentTemplate,
-    dataset: str | Path | GarmentDataset | GarmentSequences,
+    datasets: data.Sets,
     weights: str | Path | None,
     output: str | Path,
     *,
@@ -103,7 +102,7 @@ def finetune(
     if mode not in _MODES:
         raise RefuError(f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}")
     settings = settings or FinetuneSettings.of(backbone, preset)
-    opened = data.TrainingSet.of(garment, dataset, body)
+    opened = data.TrainingSet.of(garment, datasets, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     torch_device, output = start_parallel(device), Path(output)
     stem = output / f"{backbone}-{mode}"
@@ -139,7 +138,7 @@ def finetune(
     parts = [_tensors(part, body, template) for part in (train, validation)]
     loop.run(TrainingStage("refu", objective, settings.steps, *parts))
     dresser.to("cpu").eval()
-    card = described | {"refu": refu.config if refu else None, "dataset": opened.card}
+    card = described | {"refu": refu.config if refu else None, "datasets": opened.cards}
     card["knows_limbs"] = opened.knows_limbs
     if is_writer():
         others = None if refu is None else refu_tensors(refu, half=preset != "paper")

@@ -17,7 +17,6 @@ from refu_core.errors import RefuError, WeightsError
 from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
-from refu_core.simulation import GarmentDataset, GarmentSequences
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
 from refu_core.training._rehearsal import Rehearsal, plans_of
@@ -71,7 +70,7 @@ class PretrainSettings:
 
 def pretrain(
     garment: str | GarmentTemplate,
-    dataset: str | Path | GarmentDataset | GarmentSequences,
+    datasets: data.Sets,
     output: str | Path,
     *,
     backbone: str = "tailornet",
@@ -94,7 +93,8 @@ def pretrain(
 
     Args:
         garment: name of a built-in garment, or a template.
-        dataset: simulated set (`refu simulate`), of garments at rest or of sequences.
+        datasets: simulated set (`refu simulate`), of garments at rest or of sequences; or several of plans with
+            different seeds. Pivots are those of the first.
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`.
@@ -112,9 +112,9 @@ def pretrain(
         RefuError: the set is of another garment or body or too small, or a checkpoint there is of another training.
         WeightsError: no such backbone or preset, or files in `output` are damaged or of another garment.
     """
-    opened = data.TrainingSet.of(garment, dataset, body)
+    opened = data.TrainingSet.of(garment, datasets, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
-    test = data.read_samples(opened.rows, body, template, split="test")  # a missing test split is reported first
+    test = opened.test()  # a missing test split is reported first
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
     if start is None and (rehearsal is not None or joints or mode != "none"):
         raise RefuError("there is nothing to go on from or to rehearse without weights to start from")
@@ -143,7 +143,7 @@ def pretrain(
         config = model.config
         described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
         if rehearsal is not None:
-            known = opened.card["plan"]
+            known = [one["plan"] for one in opened.cards]
             rehearsed = rehearsal.of(stored.card, model, known=known)
             train = train.joined(rehearsed)
             described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card, known=known)}
@@ -160,7 +160,7 @@ def pretrain(
     card = {
         **described,
         "mode": mode,
-        "dataset": opened.card,
+        "datasets": opened.cards,
         "knows_limbs": opened.knows_limbs,
         "figures": data.backbone_figures(model, test, body, template, mean=mean),
     }
@@ -179,7 +179,7 @@ def basis_of(folder: Path, opened: data.TrainingSet, mirror: data.Mirror | None,
     displacement = data.with_mirrored(opened.samples, mirror).displacement
     basis = data.output_basis(displacement, rank=rank)
     if is_writer():
-        nets.save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": len(opened.rows)})
+        nets.save_basis(folder, basis, {**opened.identity, "samples": len(displacement), "set": opened.n_slots})
     return basis
 
 

@@ -29,11 +29,11 @@ class Rehearsal:
     """The motions of those plans; None where they have drawn poses alone."""
 
     def of(
-        self, card: Mapping[str, Any], network: Network, *, known: Mapping[str, Any] | None = None
+        self, card: Mapping[str, Any], network: Network, *, known: Sequence[Mapping[str, Any]] = ()
     ) -> TrainingSamples:
         """The samples for a trained `network` and the card of its weights; at most as many as its plans have.
 
-        The plan `known`, that of the new samples, is left out, since its truth is there.
+        The plans `known`, those of the new samples, are left out, since their truth is there.
 
         Raises `RefuError` for a card without a plan of its garment, and `SimulationError` for an invalid plan or
         missing motions.
@@ -62,10 +62,10 @@ class Rehearsal:
         return TrainingSamples(pose, betas, style, displacement, torch.arange(len(chosen)))
 
 
-def plans_of(card: Mapping[str, Any], *, known: Mapping[str, Any] | None = None) -> list[Mapping[str, Any]]:
-    """The plans that weights were trained on, by their card, except `known`: the rehearsed ones, then their set's."""
-    rehearsed, dataset = card.get("rehearsed"), card.get("dataset")
+def plans_of(card: Mapping[str, Any], *, known: Sequence[Mapping[str, Any]] = ()) -> list[Mapping[str, Any]]:
+    """The plans that weights were trained on, by their card, except `known`: the rehearsed ones, then their sets'."""
+    rehearsed, sets = card.get("rehearsed"), card.get("datasets", [card.get("dataset")])  # one set, in older cards
     earlier = rehearsed.get("plans") if isinstance(rehearsed, Mapping) else None
-    last = dataset.get("plan") if isinstance(dataset, Mapping) else None
-    found = [*(earlier if isinstance(earlier, (list, tuple)) else ()), last]
-    return [one for one in found if isinstance(one, Mapping) and {"garment", "count"} <= set(one) and one != known]
+    found = [*earlier] if isinstance(earlier, (list, tuple)) else []
+    found += [one.get("plan") for one in sets if isinstance(one, Mapping)] if isinstance(sets, (list, tuple)) else []
+    return [one for one in found if isinstance(one, Mapping) and {"garment", "count"} <= set(one) and one not in known]

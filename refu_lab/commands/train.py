@@ -106,7 +106,7 @@ def add(commands: Any) -> None:
         nargs="+",
         required=True,
         metavar="DIR",
-        help="the garment's data set; for dynamics, one or more",
+        help="the garment's data set, or several of plans with different seeds",
     )
     cli.add_options(parser, TrainOptions)
     cli.add_common(parser, run)

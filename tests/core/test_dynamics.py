@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -475,6 +476,19 @@ def test_sets_are_learnt_from_together(tmp_path: Path) -> None:
     n_frames = len(samples) // 2
     assert [one["samples"], other["samples"]] == [2 * 2 * n_frames, 2 * 3 * n_frames]
     assert both["samples"] == 2 * 4 * n_frames
+
+
+def test_a_set_may_be_for_training_or_for_the_test_alone(tmp_path: Path) -> None:
+    for_training = write_sequences(tmp_path / "training", count=3, n_test=0, seconds=0.5)
+    for_the_test = write_sequences(tmp_path / "test", count=2, n_test=2, seconds=0.5)
+    samples = read_samples(open_dataset(for_training), load_body("male"), load_garment(GARMENT), split="train")
+    weights = write(tmp_path / GARMENT, untrained(output_basis(samples.displacement, rank=8)))
+    learn = partial(train_dynamics, GARMENT, folder=weights, settings=DynamicsSettings(steps=1), quiet=True)
+    card = learn([for_the_test, for_training])
+    assert (card["samples"], card["figures"]["samples"]) == (2 * len(samples), 2 * 15)
+    for alone, wanted in ((for_training, "to test on"), (for_the_test, "to train on")):
+        with pytest.raises(RefuError, match=wanted):
+            learn([alone])
 
 
 def test_it_goes_on_from_what_a_related_garment_knows(tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ from refu_core.training._data import (
     Mirror,
     TakenAlong,
     TrainingSamples,
+    TrainingSet,
     displacements,
     mirror_pose,
     mirrored,
@@ -148,6 +149,17 @@ def test_samples_are_unposed_displacements(
     torch.testing.assert_close(errors[0], 1e3 * distance[0].norm(dim=-1), atol=1e-3, rtol=1e-4)
     with pytest.raises(RefuError, match="wanted a set whose garment is skirt-female"):
         read_samples(GarmentDataset(dataset), load_body("female"), load_garment("skirt-female"), split="train")
+
+
+def test_sets_are_one_with_pairs_of_their_own(dataset: Path, small_set: Path) -> None:
+    one, other, both = (TrainingSet.of(GARMENT, sets, None) for sets in (dataset, small_set, [dataset, small_set]))
+    n, count = len(one.samples), int(one.samples.pair.max()) + 1
+    assert torch.equal(both.samples.pose, torch.cat((one.samples.pose, other.samples.pose)))
+    assert torch.equal(both.samples.pair[n:], other.samples.pair + count)
+    assert len(both.test()) == len(one.test()) + len(other.test())
+    assert both.cards == one.cards + other.cards
+    with pytest.raises(RefuError, match="wanted a set"):
+        TrainingSet.of(GARMENT, [], None)
 
 
 @pytest.mark.parametrize("name", ["shirt-male", "tshirt-male", "short-pant-male", "skirt-female"])

@@ -89,9 +89,9 @@ def test_bodies_whose_truth_is_known_are_not_asked_about(first: Path) -> None:
     network = backbone_from_weights(stored, load_garment(GARMENT))
     later = asdict(replace(PLAN, count=24, seed=5))
     card = {"garment": GARMENT, "rehearsed": {"plans": [asdict(PLAN)]}, "dataset": {"plan": later}}
-    assert len(Rehearsal(1000).of(card, network, known=later)) == PLAN.count - PLAN.n_test
+    assert len(Rehearsal(1000).of(card, network, known=[later])) == PLAN.count - PLAN.n_test
     with pytest.raises(RefuError, match="nothing to rehearse"):
-        Rehearsal(3).of(stored.card, network, known=asdict(PLAN))
+        Rehearsal(3).of(stored.card, network, known=[asdict(PLAN)])
 
 
 def test_recorded_poses_are_those_of_the_training_motions(first: Path) -> None:

@@ -314,7 +314,7 @@ def test_networks_know_arms_that_they_are_told_of_and_that_were_beside_the_cloth
 def test_a_set_says_whether_limbs_were_beside_the_cloth(dataset: Path) -> None:
     opened = TrainingSet.of(GARMENT, dataset, None)
     for drape, knows in (({"gap": 0.012}, True), ({}, False)):
-        opened.rows.card["settings"] = {"drape": drape}
+        opened.sets[0].card["settings"] = {"drape": drape}
         assert opened.knows_limbs is knows
-    opened.rows.card.pop("settings")
+    opened.sets[0].card.pop("settings")
     assert not opened.knows_limbs

@@ -130,9 +130,12 @@ def test_motions_are_read_as_they_were_simulated(
     assert wanted in capsys.readouterr().err
 
 
-def test_several_sets_are_for_dynamics(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", GARMENT, "--data", str(data), str(data), "--output", str(tmp_path), "--quiet"]) == 2
-    assert "several sets" in capsys.readouterr().err
+def test_the_networks_of_distances_learn_from_one_set(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = ["--data", str(data), str(data), "--output", str(tmp_path), "--network", "sdf", "--quiet"]
+    assert main(["train", GARMENT, *both]) == 2
+    assert "one set" in capsys.readouterr().err
 
 
 def test_a_folder_without_a_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
