@@ -41,7 +41,12 @@ class Observer:
     """
 
     def __init__(self, pipeline: GarmentPipeline, *, settings: ObservationSettings = DEFAULT_OBSERVATION) -> None:
-        """Prepares for the garments of a pipeline: seconds the first time, after which the result is cached."""
+        """Prepares for the garments of a pipeline: seconds the first time, after which the result is cached.
+
+        Raises `FrameError` for no pipeline, or no settings.
+        """
+        require_type(pipeline, GarmentPipeline, "a GarmentPipeline", error=FrameError)
+        require_type(settings, ObservationSettings, "ObservationSettings", error=FrameError)
         self._pipeline, self._settings = pipeline, settings
         self._cloths = {name: ObservedCloth(garment, settings) for name, garment in pipeline.garments.items()}
         body = pipeline.body

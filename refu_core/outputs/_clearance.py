@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from refu_core.body import SmplBody
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import as_points
-from refu_core.outputs._worn import require_known, require_worn
+from refu_core.outputs._worn import require_known, require_outfit, require_pipeline, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.sdf import BandSdf
 
@@ -31,13 +31,18 @@ class Clearance:
     reach = REACH
 
     def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
-        """For garments on a body. Everything is on the CPU, where a pipeline's outputs are."""
+        """For garments on a body. Everything is on the CPU, where a pipeline's outputs are.
+
+        Raises `MeshError` for anything else.
+        """
+        require_outfit(body, garments)
         self._sdf = BandSdf(body.faces.cpu(), band=self.reach, rest=body.v_template.detach().cpu())
         self._rings = {name: garment.mesh.ring for name, garment in garments.items()}
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> Clearance:
-        """For the outputs of a pipeline."""
+        """For the outputs of a pipeline. Raises `MeshError` for anything else."""
+        require_pipeline(pipeline)
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> dict[str, NDArray[np.float32]]:

@@ -21,6 +21,7 @@ from refu_core.outputs._openings import Opening, Openings
 from refu_core.outputs._planner import PlannerMesh
 from refu_core.outputs._sigma import Sigma
 from refu_core.outputs._visible import PinholeCamera, all_visible
+from refu_core.outputs._worn import require_known, require_pipeline
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 
@@ -56,7 +57,11 @@ class Fittings:
     """What is computed once for a pipeline's garments and its body, when it is first asked for."""
 
     def __init__(self, pipeline: GarmentPipeline, *, weights: str | os.PathLike[str] | None = None) -> None:
-        """For a pipeline, and the folder of weights that it was loaded with, if any."""
+        """For a pipeline, and the folder of weights that it was loaded with, if any.
+
+        Raises `MeshError` for no pipeline.
+        """
+        require_pipeline(pipeline)
         self.pipeline, self._weights = pipeline, weights
         self.garments = pipeline.garments
         self.names = tuple(self.garments)
@@ -89,12 +94,14 @@ class Fittings:
 
     def planner(self, name: str) -> PlannerMesh:
         """A garment's mesh for planners; takes ten seconds or so when it is made for the first time ever."""
+        require_known(name, self.garments)
         if name not in self._planners:
             self._planners[name] = PlannerMesh.of(self.pipeline, name)
         return self._planners[name]
 
     def has_planner(self, name: str) -> bool:
         """Whether `planner` would answer at once. The first call starts to make the mesh, in a thread of its own."""
+        require_known(name, self.garments)
         if name not in self._preparing:
             self._preparing[name] = threading.Thread(target=self._prepare_planner, args=(name,), daemon=True)
             self._preparing[name].start()

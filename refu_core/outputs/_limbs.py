@@ -14,7 +14,7 @@ from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody, part_of_faces
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
-from refu_core.outputs._worn import require_worn
+from refu_core.outputs._worn import require_outfit, require_pipeline, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 PRESSED = DEFAULT_GAP + 0.003
@@ -49,7 +49,8 @@ class LimbContacts:
     """
 
     def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
-        """For garments on a body, on the CPU."""
+        """For garments on a body, on the CPU. Raises `MeshError` for anything else."""
+        require_outfit(body, garments)
         self._faces = {name: garment.faces.cpu().numpy() for name, garment in garments.items()}
         self._points, self._shift = memory(2, body.n_vertices, 3)
         self._points.copy_(body.v_template.detach())
@@ -68,7 +69,8 @@ class LimbContacts:
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> LimbContacts:
-        """For the outputs of a pipeline."""
+        """For the outputs of a pipeline. Raises `MeshError` for anything else."""
+        require_pipeline(pipeline)
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:

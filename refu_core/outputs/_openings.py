@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core.body import ARMS, LEGS, joints_of
-from refu_core.errors import MeshError, require_type
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import as_points, rim_of
+from refu_core.outputs._worn import require_garment
 
 NAMES = ("neck", "left_sleeve", "right_sleeve", "waist", "hem", "left_leg", "right_leg", "front")
 """What openings are called, in the order in which they are listed; others are `opening_0`, `opening_1`, …"""
@@ -199,7 +199,7 @@ class Openings:
 
         Raises `MeshError` for anything else, such as a mesh that it is worn as.
         """
-        require_type(garment, GarmentTemplate, "a garment, as pipeline.garments[name]", error=MeshError)
+        require_garment(garment)
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)
         rings = rings_of(garment)

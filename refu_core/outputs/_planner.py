@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from itertools import product
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from refu_core.frames import SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity, as_points, rim_of, symmetric_solver, vertex_areas
 from refu_core.outputs._simplify import CoarseSheet
+from refu_core.outputs._worn import require_garment, require_pipeline
 from refu_core.realtime import GarmentPipeline
 from refu_core.skeleton import posed
 
@@ -178,7 +180,10 @@ class PlannerMesh:
         without it only the rest pose is used. Raises `MeshError` for fewer than 100 triangles, for no thickness, and if
         a garment can't be made that coarse.
         """
-        if max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
+        require_garment(garment)
+        numbers: tuple[object, ...] = max_triangles, half_thickness
+        are_numbers = all(isinstance(number, Real) for number in numbers)
+        if not are_numbers or max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
             wanted = f"{_LEAST_TRIANGLES} triangles or more and a positive half thickness"
             raise MeshError(f"wanted {wanted}, got {max_triangles} and {half_thickness}")
         self.half_thickness = float(half_thickness)
@@ -209,9 +214,10 @@ class PlannerMesh:
 
         Raises `MeshError` as the constructor does, and where the pipeline has no such garment.
         """
-        template = pipeline.garments.get(garment)
-        if template is None:
+        require_pipeline(pipeline)
+        if not isinstance(garment, str) or garment not in pipeline.garments:
             raise MeshError(f"the pipeline has no garment {garment!r}: wanted one of {', '.join(pipeline.garments)}")
+        template = pipeline.garments[garment]
         return cls(template, max_triangles, half_thickness=half_thickness, worn=lambda: _practised(pipeline, garment))
 
     def middle(self, vertices: Any) -> NDArray[np.float64]:

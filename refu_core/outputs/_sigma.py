@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.backbones import SEEN_TILT
 from refu_core.body import SmplBody
-from refu_core.errors import FrameError, MeshError, WeightsError
+from refu_core.errors import FrameError, MeshError, WeightsError, require_type
 from refu_core.frames import LAGS, N_JOINTS, SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.keypoints._pose import skew
-from refu_core.outputs._worn import require_worn
+from refu_core.outputs._worn import require_garment, require_pipeline, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.skeleton import CARRIED
 from refu_core.weights import load_weights, save_weights, weights_folder
@@ -66,6 +66,7 @@ class SigmaMap:
 
 def bend_of(garment: GarmentTemplate, pose: NDArray[Any]) -> NDArray[np.float64]:
     """How much the joints that affect a garment, except the root, bend [rad] in poses (…, 24, 3) [rad]; shape (…,)."""
+    require_garment(garment)
     joints = [joint for joint in garment.card.joints if joint != 0]
     angle = np.linalg.norm(np.asarray(pose, np.float64)[..., joints, :], axis=-1)
     wrapped = np.remainder(angle + np.pi, 2 * np.pi) - np.pi  # a rotation of 350° is one of 10°
@@ -90,7 +91,11 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     (N, 24, 3). In each pose region σ is scaled so that nine in ten of the true vertices are within `RADIUS_90` σ.
     Raises `MeshError` for arrays of other shapes, and for fewer than 10 samples a region.
     """
-    length, where = np.asarray(errors, np.float64), np.asarray(poses, np.float64)
+    require_garment(garment)
+    try:
+        length, where = np.asarray(errors, np.float64), np.asarray(poses, np.float64)
+    except (TypeError, ValueError) as error:
+        raise MeshError(f"errors and poses must be arrays of numbers: {error}") from error
     n = len(length)
     is_shaped = length.shape == (n, garment.n_vertices) and where.shape == (n, N_JOINTS, 3)
     if not is_shaped or not (np.isfinite(length).all() and np.isfinite(where).all()):
@@ -118,6 +123,8 @@ def save_sigma(
 
     Raises `WeightsError` where it can't be written.
     """
+    require_garment(garment)
+    require_type(found, SigmaMap, "a SigmaMap", error=WeightsError)
     tensors = {name: torch.from_numpy(getattr(found, name)) for name in ("sigma", "bend", "factor")}
     tensors["sigma"] = tensors["sigma"].half()
     about = {"garment": garment.name, "n_vertices": garment.n_vertices, **card}
@@ -129,6 +136,7 @@ def load_sigma(garment: GarmentTemplate, *, folder: str | os.PathLike[str] | Non
 
     Raises `WeightsError` for a file that is damaged, or of another garment.
     """
+    require_garment(garment)
     stem = weights_folder(garment.name, folder) / "sigma"
     if not stem.with_suffix(".json").exists():
         return SigmaMap.unknown(garment.n_vertices)
@@ -149,8 +157,9 @@ class Sigma:
     def __init__(self, pipeline: GarmentPipeline, *, folder: str | os.PathLike[str] | None = None) -> None:
         """For a pipeline; `folder` is that of the user's own weights, if the pipeline was loaded with one.
 
-        Raises `WeightsError` for a damaged file of σ.
+        Raises `WeightsError` for a damaged file of σ, and `MeshError` for no pipeline.
         """
+        require_pipeline(pipeline)
         self._body, self._garments = pipeline.body, pipeline.garments
         self.maps: dict[str, SigmaMap] = {}
         """By garment. One that no network drapes, or whose network wasn't measured, has `UNKNOWN_SIGMA`."""

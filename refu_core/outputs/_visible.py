@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
-from refu_core.errors import MeshError
+from refu_core.errors import MeshError, require_type
 from refu_core.frames import checked_numbers
 from refu_core.mesh import as_points, check_faces
 from refu_core.outputs import _visible_kernels as kernels
@@ -34,7 +35,7 @@ Mesh = tuple[ArrayLike, ArrayLike]
 class PinholeCamera:
     """A camera without distortion: x to the right, y down, z forward, as in the optical frames of ROS.
 
-    Raises `MeshError` for numbers that can't be a camera's.
+    Raises `MeshError` for numbers that can't be a camera's, and `FrameError` for what isn't numbers.
     """
 
     width: int
@@ -51,18 +52,20 @@ class PinholeCamera:
     """The meshes' origin in the camera's axes [m], shape (3,)."""
 
     def __post_init__(self) -> None:
-        rotation = np.asarray(self.rotation, dtype=np.float64)
-        translation = np.asarray(self.translation, dtype=np.float64)
-        numbers = [*self.focal, *self.centre, *rotation.ravel(), *translation.ravel()]
-        is_sized = min(self.width, self.height, *self.focal) > 0 and bool(np.isfinite(numbers).all())
-        is_shaped = (rotation.shape, translation.shape) == ((3, 3), (3,))
-        is_turn = is_shaped and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
-        if not (is_sized and is_turn):
-            msg = (
-                "a camera has a size in pixels, positive focal lengths, a rotation (3, 3) and a translation (3,), got "
-                f"{self.width} x {self.height}, {self.focal}, {rotation.tolist()}, {translation.tolist()}"
+        rotation, translation, _, focal, size = (
+            checked_numbers(f"a camera's {name}", value, shape, np.float64)
+            for name, value, shape in (
+                ("rotation", self.rotation, (3, 3)),
+                ("translation", self.translation, (3,)),
+                ("centre", self.centre, (2,)),
+                ("focal", self.focal, (2,)),
+                ("width and height", (self.width, self.height), (2,)),
             )
-            raise MeshError(msg)
+        )
+        is_turn = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
+        if min(*focal, *size) <= 0 or not is_turn:
+            wanted = "a camera has a size in pixels, positive focal lengths and a rotation that isn't a mirror"
+            raise MeshError(f"{wanted}, got {self.width} x {self.height}, {self.focal} and {rotation.tolist()}")
         vars(self).update(rotation=rotation, translation=translation)
 
     @classmethod
@@ -75,6 +78,9 @@ class PinholeCamera:
         three numbers; `MeshError` for a `fov` beyond 0 to π, no width, and a camera that looks straight up or down.
         """
         target, eye = (checked_numbers(name, at, (3,), np.float64) for name, at in (("target", target), ("eye", eye)))
+        given: tuple[object, ...] = width, height, fov
+        if not all(isinstance(number, Real) for number in given):
+            raise MeshError(f"wanted width, height and fov as numbers, got {width!r}, {height!r} and {fov!r}")
         if not 0 < fov < math.pi or not width > 0:
             raise MeshError(f"wanted a positive width and an angle below 180 degrees, got {width} pixels and {fov} rad")
         away = target - eye
@@ -114,6 +120,7 @@ def visible(
     buffer, which has `buffer_width` columns, may be missed. Raises `MeshError` for vertices that aren't finite, and for
     faces that don't fit them.
     """
+    require_type(occluders, Sequence, "occluders as a list of meshes", error=MeshError)
     return all_visible([(vertices, faces), *occluders], camera, buffer_width=buffer_width)[0]
 
 
@@ -121,6 +128,7 @@ def all_visible(
     meshes: Sequence[Mesh], camera: PinholeCamera, *, buffer_width: int = BUFFER_WIDTH
 ) -> list[NDArray[np.bool_]]:
     """`visible` for several meshes that hide each other, at the cost of one. Raises `MeshError` as `visible` does."""
+    _check(meshes, camera)
     if not meshes:
         return []
     points, faces, buffer, ends = _draw(meshes, _buffered(camera, buffer_width))
@@ -141,10 +149,19 @@ def depth_image(meshes: Sequence[Mesh], camera: PinholeCamera) -> NDArray[np.flo
 
     Infinite where there is nothing. Raises `MeshError` as `visible` does.
     """
+    _check(meshes, camera)
     if not meshes:
         return np.full((camera.height, camera.width), np.inf, np.float32)
     found = _draw(meshes, camera)[2].numpy()
     return np.where(found == np.iinfo(np.int64).max, np.inf, (found >> 32) * 1e-6).astype(np.float32)
+
+
+def _check(meshes: object, camera: object) -> None:
+    require_type(camera, PinholeCamera, "a PinholeCamera", error=MeshError)
+    require_type(meshes, Sequence, "a list of meshes", error=MeshError)
+    assert isinstance(meshes, Sequence)
+    if not all(isinstance(mesh, (tuple, list)) and len(mesh) == 2 for mesh in meshes):
+        raise MeshError("wanted meshes as pairs of vertices (V, 3) and faces (F, 3)")
 
 
 def _draw(meshes: Sequence[Mesh], camera: PinholeCamera) -> tuple[Any, Any, Any, NDArray[np.int64]]:

@@ -4,7 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
+from refu_core.body import SmplBody
 from refu_core.errors import MeshError, require_type
+from refu_core.garments import GarmentTemplate
+from refu_core.realtime import GarmentPipeline
+
+
+def require_pipeline(pipeline: object) -> None:
+    """Raises `MeshError` for anything but a pipeline."""
+    require_type(pipeline, GarmentPipeline, "a GarmentPipeline", error=MeshError)
+
+
+def require_outfit(body: object, garments: object) -> None:
+    """Raises `MeshError` for anything but a body and garments by name."""
+    require_type(body, SmplBody, "a SmplBody, as load_body gives", error=MeshError)
+    require_type(garments, Mapping, "garments by name", error=MeshError)
+    assert isinstance(garments, Mapping)
+    for garment in garments.values():
+        require_garment(garment)
+
+
+def require_garment(garment: object) -> None:
+    """Raises `MeshError` for anything but a garment."""
+    require_type(garment, GarmentTemplate, "a garment, as pipeline.garments[name]", error=MeshError)
 
 
 def require_worn(output: object, known: Collection[str]) -> None:
@@ -17,5 +39,5 @@ def require_worn(output: object, known: Collection[str]) -> None:
 
 def require_known(name: str, known: Collection[str]) -> None:
     """Raises `MeshError` for a garment that isn't `known`."""
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         raise MeshError(f"no garment {name!r} here: wanted one of {', '.join(known)}")

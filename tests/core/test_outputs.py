@@ -17,8 +17,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.outputs._topics import Moment, Obstacles
-from refu_core import ExactSdf, GarmentPipeline, GarmentTemplate, MeshError, SmplFrame, load_garment
+from refu_core import (
+    ExactSdf,
+    GarmentPipeline,
+    GarmentTemplate,
+    MeshError,
+    RefuError,
+    SmplFrame,
+    load_body,
+    load_garment,
+)
 from refu_core.garments import BUILTIN_GARMENTS
+from refu_core.observation import Observer
 from refu_core.outputs import (
     Clearance,
     DressedPerson,
@@ -30,6 +40,8 @@ from refu_core.outputs import (
     Sigma,
     all_visible,
     depth_image,
+    fit_sigma,
+    load_sigma,
     visible,
 )
 from refu_core.outputs._visible import BUFFER_WIDTH, _buffered
@@ -417,3 +429,22 @@ def test_what_is_seen_of_two_squares() -> None:
 def test_bad_input_gets_a_sentence(call, said: str) -> None:
     with pytest.raises(MeshError, match=said):
         call()
+
+
+@pytest.mark.parametrize("wrong", [None, 5, "x", b"y", [], {}, np.zeros((2, 2)), np.array(["a"]), len])
+@pytest.mark.parametrize(
+    "call",
+    [
+        *(Clearance.of, LimbContacts.of, Fittings, Sigma, Observer, lambda x: PlannerMesh.of(x, "tshirt-male")),
+        *(Openings, PlannerMesh, load_sigma, lambda x: fit_sigma(x, np.ones((40, 5)), np.zeros((40, 24, 3)))),
+        *(lambda x: Clearance(x, {}), lambda x: LimbContacts(load_body("male"), {"tshirt-male": x})),
+        *(lambda x: visible(np.zeros((3, 3)), [[0, 1, 2]], x), lambda x: depth_image([], x)),
+        lambda x: PlannerMesh(load_garment("tshirt-male"), half_thickness=[x]),
+        lambda x: PinholeCamera.looking_at((0, 0, 0), (0, 0, 3), fov=x),
+        lambda x: PinholeCamera(9, 9, x, (0, 0), np.eye(3), np.zeros(3)),
+        lambda x: PinholeCamera(9, 9, (1, 1), (0, 0), x, np.zeros(3)),
+    ],
+)
+def test_another_type_gets_a_sentence(call, wrong: object) -> None:
+    with pytest.raises(RefuError):
+        call(wrong)
