@@ -20,7 +20,7 @@ from refu_core.skeleton import JOINT_NAMES, PARENTS
 
 @dataclass(frozen=True, kw_only=True)
 class TrackerSettings:
-    """The numbers, tuned on ten clips of CMU at 30 and 60 Hz; `docs/guide/inputs.md` has the results."""
+    """The numbers, tuned on ten clips of CMU; docs/results/keypoints.md has what half and twice of each do."""
 
     smoothing: float = 1.0
     """How much smoother than the most likely motion: accelerations are taken to be this many times smaller."""

@@ -9,12 +9,11 @@ a while and then comes to rest, and how much a keypoint moves the pose depends o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from refu_core.errors import FrameError, as_before_if_it_fails, require_type
 from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
@@ -59,7 +58,9 @@ class KeypointTracker:
         self._solver = Solver(skeleton, fits_betas=betas is None, settings=settings)
         layout = skeleton.layout
         joints, other = layout.joints, layout.mirrored
-        self._sides = [np.flatnonzero(np.isin(joints, group) & (other != np.arange(len(other)))) for group in _GROUPS]
+        has_side = other != np.arange(len(other))
+        self._sided_ones = np.flatnonzero(has_side)
+        self._limbs = [[np.flatnonzero(np.isin(joints, part) & has_side) for part in limb] for limb in _LIMBS]
         power = [np.full(3, settings.push), np.full(3 * N_JOINTS, settings.twist), np.zeros(N_BETAS)]
         self._power = np.concatenate(power) / settings.smoothing**2
         self._offset = np.where(layout.is_joint, 0.0, settings.offset_noise)
@@ -214,7 +215,7 @@ class KeypointTracker:
         return float(np.sqrt(np.mean(np.minimum(off, 0.5) ** 2))) if len(off) else 0.0
 
     def _sided(self, seen: _Seen, dt: float) -> _Seen | None:
-        """The frame with the sides of arms, legs or face exchanged if they are wrong; None if it is somebody else's.
+        """The frame with sides exchanged where they are wrong; None if it is somebody else's.
 
         If all keypoints are near where they were expected, nothing is changed.
         """
@@ -226,19 +227,33 @@ class KeypointTracker:
             return seen
         if visible.sum() >= 4 and float(np.median(off[visible])) > self._settings.jump**2:
             return None
-        other, taken, is_swapped = self.skeleton.layout.mirrored, np.arange(len(visible)), False
-        both = visible & visible[other]
-        for group in self._sides:
-            here = group[both[group]]
-            if len(here) < 2 or off[here].max() < _NEAR**2:
-                continue
-            exchanged = np.square(seen.points[other[here]] - expected[here]).sum(axis=1)
-            if np.minimum(exchanged, _FAR**2).sum() < 0.4 * np.minimum(off[here], _FAR**2).sum():
-                taken[here], is_swapped = other[here], True
+        other = self.skeleton.layout.mirrored
+        exchanged = np.square(seen.points - expected[other]).sum(axis=1)
+        told, exchanged = (np.where(visible, np.minimum(squared, _FAR**2), 0.0) for squared in (off, exchanged))
+        taken = np.arange(len(other))
+        for group in self._wrong_sided(told, exchanged):
+            taken[group] = other[group]
+        is_swapped = bool((taken != np.arange(len(other))).any())
         self._swapped_for = self._swapped_for + dt if is_swapped else 0.0
         if self._swapped_for > self._settings.doubt:  # it was the prediction that had the sides wrong
             return seen
         return _Seen(seen.points[taken], seen.weights[taken])
+
+    def _wrong_sided(self, told: Array, exchanged: Array) -> list[NDArray[np.intp]]:
+        """The groups of keypoints whose sides are wrong: of each limb the part that explains most, or all of them.
+
+        Given how far keypoints are from where they were expected, as told and with sides exchanged [m²], shape (K,).
+        """
+
+        def gain(group: NDArray[np.intp]) -> float:
+            before, after = told[group], exchanged[group]
+            is_clear = before.max(initial=0.0) >= _NEAR**2 and after.sum() < _CLEAR * before.sum()
+            return float(before.sum() - after.sum()) if is_clear else 0.0
+
+        of_limbs = [max(limb, key=gain) for limb in self._limbs]
+        # A limb of which little is seen is taken for exchanged where most of the person is.
+        found = [self._sided_ones] if gain(self._sided_ones) > sum(map(gain, of_limbs)) else of_limbs
+        return [group for group in found if gain(group) > 0]
 
     # The filter -----------------------------------------------------------------------------------
 
@@ -301,8 +316,12 @@ def _wound(pose: Pose) -> float:
     return float(np.linalg.norm(log_so3(pose.turns[_SPINE]), axis=1).sum())
 
 
-_GROUPS = ((16, 18, 20, 22, 17, 19, 21, 23), (1, 4, 7, 10, 2, 5, 8, 11), (15,))
-"""Joints of arms, legs and head, whose keypoints trackers exchange together."""
+_LIMBS = (
+    ((16, 18, 20, 22, 17, 19, 21, 23), (18, 20, 22, 19, 21, 23), (20, 22, 21, 23)),
+    ((1, 4, 7, 10, 2, 5, 8, 11), (4, 7, 10, 5, 8, 11), (7, 10, 8, 11)),
+    ((15,),),
+)
+"""Joints of arms, legs and head, whose keypoints trackers exchange together, from some joint on outwards."""
 _WOUND = 2.2
 """The joints of a spine rarely turn by more than this together [rad]: deep bends have 1.8."""
 _SPINE = [JOINT_NAMES.index(f"spine{i}") for i in (1, 2, 3)]
@@ -316,73 +335,7 @@ _FARTHEST = 3.0
 """No person's keypoints are farther than this from their middle, in the median [m]: they are in another unit."""
 _FITS = 0.04
 """A first pose that misses its keypoints by less than this [m] has its sides right."""
+_CLEAR = 0.4
+"""Sides are exchanged if that leaves less than this of the squared distances to where keypoints were expected."""
 _NEAR, _FAR = 0.1, 0.5
 """A keypoint within `_NEAR` of its expected place is on its side; a distance beyond `_FAR` counts as `_FAR` [m]."""
-
-
-MOST_PEOPLE = 64
-"""Most people followed at once; beyond that, whoever's keypoints haven't come for longest is forgotten."""
-
-
-@dataclass
-class _Person:
-    track: KeypointTracker
-    newest_ns: int
-    """Stamp of the newest keypoints, by the sender's clock."""
-    came_ns: int
-    """When they came, by the receiver's clock."""
-    went_on_ns: int
-    """When a stamp was last later than the one before it."""
-    last_ns: int = -1
-    """The last stamp, by the sender's clock."""
-
-
-class People:
-    """Tracks by name. Times are of two clocks: the sender's stamps, and when messages came. Not thread-safe."""
-
-    def __init__(
-        self, skeleton: Skeleton, *, betas: ArrayLike | None = None, settings: TrackerSettings = DEFAULTS
-    ) -> None:
-        self.skeleton = skeleton
-        self._betas, self._settings = betas, settings
-        self._people: dict[str, _Person] = {}
-
-    def update(
-        self, person: str, points: ArrayLike, *, confidence: ArrayLike | None, stamp_ns: int, now_ns: int
-    ) -> SmplFrame | None:
-        """A person's pose after a frame of keypoints; as `KeypointTracker.update`.
-
-        Stamps that haven't advanced for `hold` say nothing; the time at which messages come is then used instead.
-        """
-        one = self._people.pop(person, None)
-        if one is None:
-            track = KeypointTracker(self.skeleton, betas=self._betas, settings=self._settings)
-            one = _Person(track, stamp_ns, now_ns, now_ns)
-        self._people[person] = one
-        one.went_on_ns = now_ns if stamp_ns > one.last_ns else min(one.went_on_ns, now_ns)
-        one.last_ns = stamp_ns
-        if 1e-9 * (now_ns - one.went_on_ns) > self._settings.hold:
-            stamp_ns = now_ns
-        before = one.track.stamp_ns
-        frame = one.track.update(points, stamp_ns, confidence=confidence)
-        if one.track.stamp_ns != before:  # otherwise they were older than those that are known
-            one.newest_ns, one.came_ns = stamp_ns, now_ns
-        for gone in list(self._people)[:-MOST_PEOPLE]:
-            del self._people[gone]
-        return frame
-
-    def at(self, now_ns: int) -> dict[str, SmplFrame]:
-        """Everybody's pose by now, moved on from their newest keypoints by the age of these.
-
-        The age is measured on the receiver's clock, since senders' clocks differ. If that clock was set back by more
-        than `hold`, people are forgotten until their keypoints come again.
-        """
-        poses = {}
-        for person, one in self._people.items():
-            age_ns = now_ns - one.came_ns
-            if 1e-9 * age_ns < -self._settings.hold:
-                one.track.reset()
-            frame = one.track.at(one.newest_ns + max(0, age_ns))
-            if frame is not None:
-                poses[person] = frame
-        return poses

@@ -288,6 +288,7 @@ def write_summary(folder: Path) -> Path:
         "performance.md": "Run time: `refu benchmark`",
         "collider.md": "The collider: what each number does",
         "contact.md": "Collision handling: what each number does",
+        "keypoints.md": "Keypoints: what each number does",
     }
     links += [f"- [{title}]({file})" for file, title in others.items() if (folder / file).exists()]
     about = folder / "about.txt"

@@ -246,6 +246,33 @@ def test_exchanged_sides_are_put_right(group: tuple[str, ...]) -> None:
 
 
 @pytest.mark.parametrize("layout", ["coco17", "zed38"])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ("",),
+        *(("shoulder", "elbow", "wrist", "hand"), ("elbow", "wrist", "hand"), ("wrist", "hand")),
+        *(("hip", "knee", "ankle", "foot"), ("knee", "ankle", "foot"), ("ankle", "foot")),
+    ],
+)
+def test_exchanged_sides_cost_nothing_though_a_third_is_not_seen(layout: str, parts: tuple[str, ...]) -> None:
+    kept = keypoint_layout(layout)
+    these = [i for i, joint in enumerate(kept.joints) if any(part in JOINT_NAMES[joint] for part in parts)]
+    rng = np.random.default_rng(5)
+    holes = rng.random((75, len(kept))) < 0.3
+
+    def change(i: int, points: Array, *, is_exchanged: bool) -> Array:
+        if is_exchanged and i % 30 > 20:
+            points[these] = points[kept.mirrored[these]]
+        points[holes[i]] = np.nan
+        return points
+
+    (got, known), (plain, _) = (
+        followed(partial(change, is_exchanged=exchanged), layout, "reach_squat") for exchanged in (True, False)
+    )
+    assert errors(got, known).mean() < 1.15 * errors(plain, known).mean()
+
+
+@pytest.mark.parametrize("layout", ["coco17", "zed38"])
 def test_legs_exchanged_in_the_first_frame_are_put_right_after_a_second(layout: str) -> None:
     """Although the rest of the body fits well meanwhile."""
     kept = keypoint_layout(layout)
