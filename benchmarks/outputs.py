@@ -29,6 +29,8 @@ BAGS = Path(__file__).parents[1] / "bags"
 GARMENTS = ("tshirt-male", "shirt-male", "short-pant-male", "skirt-female")
 SENSOR = 0.003
 """Noise of a depth camera at 2 m [m]."""
+STEREO = (0.01, 0.02, 0.03)
+"""Noise of stereo cameras, at 2 to 5 m [m]."""
 Points = NDArray[np.float64]
 
 
@@ -121,10 +123,12 @@ def sigma() -> None:
     print(f"sigma      tshirt-male in motion: 90 % holds {100 * share:.1f} %")
 
 
-def measured(depth: NDArray[np.float32], camera: outputs.PinholeCamera, rng: np.random.Generator) -> Points:
+def measured(
+    depth: NDArray[np.float32], camera: outputs.PinholeCamera, rng: np.random.Generator, *, noise: float = SENSOR
+) -> Points:
     """A depth picture as points in the world's axes, with a sensor's noise."""
     row, column = np.nonzero(np.isfinite(depth))
-    z = depth[row, column] + rng.normal(0, SENSOR, len(row))
+    z = depth[row, column] + rng.normal(0, noise, len(row))
     ways = [(column + 0.5 - camera.centre[0]) / camera.focal[0], (row + 0.5 - camera.centre[1]) / camera.focal[1]]
     return (np.stack((ways[0] * z, ways[1] * z, z), 1) - camera.translation) @ camera.rotation
 
@@ -134,13 +138,16 @@ def observation() -> None:
     for garment in GARMENTS:
         pipeline = GarmentPipeline.load([garment])
         moments = moments_of(bag_of(garment), pipeline.garments[garment])
-        _follow(pipeline, garment, [one for one in moments if one.pair % 2 == 1], keeps=False)
+        for noise in (SENSOR, *STEREO):
+            _follow(pipeline, garment, [one for one in moments if one.pair % 2 == 1], keeps=False, noise=noise)
     pipeline = GarmentPipeline.load(["tshirt-male"])
     moments = moments_of(BAGS / "eval_tshirt_male_sequence", pipeline.garments["tshirt-male"])
     _follow(pipeline, "tshirt-male", moments, keeps=True)
 
 
-def _follow(pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *, keeps: bool) -> None:
+def _follow(
+    pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *, keeps: bool, noise: float = SENSOR
+) -> None:
     observer, faces = Observer(pipeline), pipeline.garments[garment].faces.numpy()
     skin_faces, rng = pipeline.body.faces.numpy(), np.random.default_rng(0)
     plain, compared, followed, foreseen, inside = [], [], [], [], 0
@@ -153,7 +160,7 @@ def _follow(pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *
         eye = middle + np.array([2 * np.sin(way), 0.5, 2 * np.cos(way)])
         camera = outputs.PinholeCamera.looking_at(middle, eye, width=320, height=240)
         skin = (out.skin, skin_faces)
-        points = measured(outputs.depth_image([(moment.truth, faces), skin], camera), camera, rng)
+        points = measured(outputs.depth_image([(moment.truth, faces), skin], camera), camera, rng, noise=noise)
         seen = moment.truth[outputs.visible(moment.truth, faces, camera, [skin])]
 
         def off(vertices: NDArray[np.float32], seen: Points = seen) -> float:
@@ -170,9 +177,9 @@ def _follow(pipeline: GarmentPipeline, garment: str, moments: list[TrueFrame], *
         compared.append(plain[-1])
     before, after = np.mean(compared), np.mean(followed)
     print(
-        f"observed   {garment:16} {'in motion ' if keeps else ''}{len(moments)} frames: visible error {before:.2f} → "
-        f"{after:.2f} mm (-{100 * (1 - after / before):.0f} %), worst {max(plain):.1f} → {max(followed):.1f}; "
-        f"{inside} vertices inside the body"
+        f"observed   {garment:16} {'in motion ' if keeps else ''}{len(moments)} frames, noise {1e3 * noise:g} mm: "
+        f"visible error {before:.2f} → {after:.2f} mm (-{100 * (1 - after / before):.0f} %), "
+        f"worst {max(plain):.1f} → {max(followed):.1f}; {inside} vertices inside the body"
     )
     if foreseen:
         before, after = np.mean(foreseen, axis=0)

@@ -45,7 +45,9 @@ class ObservationSettings:
     bound: float = 3.0
     """Each number stays within this many of its standard deviations, whatever is measured."""
     noise: float = 0.003
-    """Standard deviation of a cell's point along the normal, and of what the fields can't follow [m]."""
+    """Least standard deviation of a cell's point along the normal, and of what the fields can't follow [m]. How cells
+    differ from their neighbours shows when points are noisier: with 20 mm of noise shorts were off by 6.4 mm instead of
+    3.3, which they are without points."""
     enough: float = 2.0
     """A cell of space with this many points counts half as much as one with very many: what the fields can't follow is
     alike in neighbouring points, so more of them don't average it out."""

@@ -22,8 +22,9 @@ def match_kernel(
 ) -> None:
     """The closest place of the cloth within `reach`; the face is -1 for a point that isn't the cloth's.
 
-    Such a point is nearer to one of the `others`, is nearer to the skin by more than `slack`, is beyond a rim, or is
-    closest to a face that faces away from the camera.
+    Such a point is nearer to one of the `others`, is nearer by more than `slack` to skin that isn't below the cloth, as
+    that of a hand in front of it, is beyond a rim, or is closest to a face that faces away from the camera. Skin below
+    the cloth can't be seen: without its points, noise would be taken for cloth that lies farther out.
     """
     i = wp.tid()
     p = points[i]
@@ -52,7 +53,9 @@ def match_kernel(
     if nearer > 0.0:
         below = wp.mesh_query_point_no_sign(skin, p, nearer)
         if below.result:
-            return
+            on_skin = wp.mesh_eval_position(skin, below.face, below.u, below.v)
+            if wp.dot(on_skin - place, n) > 0.0:
+                return
     face[i] = query.face
     weight[i] = wp.vec3(query.u, query.v, w)
     normal[i] = n
