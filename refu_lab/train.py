@@ -58,7 +58,11 @@ def _train(
     common["body"] = body
     given = template, datasets, options.folder
     motions = options.motions and load_clips(options.motions, axes=options.input_axes, fps=options.fps)
-    rehearsal = None if options.rehearse is None else training.Rehearsal(options.rehearse, motions)
+    rehearsal = (
+        None
+        if options.rehearse is None
+        else training.Rehearsal(options.rehearse, motions, further=options.further, teachers=options.teachers)
+    )
     if options.network == "dynamics":
         common |= {"mode": options.mode, "like": options.like}
         moving = _seeded(training.DynamicsSettings(), options, **steps)
@@ -73,7 +77,7 @@ def _train(
         return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
     common |= {"backbone": options.backbone, "preset": options.preset}
     of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
-    count = sum(int(one.train.sum()) for one in datasets)
+    count = sum(int(one.train.sum()) for one in datasets) or options.rehearse or 0
     first = training.PretrainSettings.of(options.backbone, options.preset, samples=count)
     first = _seeded(first, options, **of_all)
     if options.start is not None:
@@ -99,7 +103,11 @@ def _check(options: TrainOptions) -> None:
     changed = options.scale, options.margin, options.unblended, options.network, options.preset
     is_changed = changed != ("vertex", None, False, "garment", "realtime")
     presets = SDF_PRESETS if options.network == "sdf" else PRESETS
+    learns_from_weights = options.network == "garment" and options.start is not None and options.rehearse is not None
     refused = {
+        "give --data, a set of refu simulate; what weights know alone is learnt with --start and --rehearse": (
+            not options.data and not learns_from_weights
+        ),
         "the distance's network learns from one set of --data": len(options.data) > 1 and options.network == "sdf",
         "--like makes a tailornet of the preset realtime, or dynamics: leave --backbone, --preset and others out": (
             options.like is not None and options.network != "dynamics" and not is_plain

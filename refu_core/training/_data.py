@@ -9,76 +9,20 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core.backbones import Backbone, BasisDecoder, TailorNet, backbone_from_weights, style_shape
-from refu_core.body import MIRRORED_JOINTS, Collider, SmplBody, load_body
+from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import RefuError
-from refu_core.garments import GarmentTemplate, SkinBelow, load_garment
+from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.garments import N_STYLES, GarmentTemplate, SkinBelow, load_garment
 from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, dequantise, open_dataset
+from refu_core.training._mirror import Mirror as Mirror
+from refu_core.training._mirror import SurfaceMixture as SurfaceMixture
+from refu_core.training._mirror import mirror_pose as mirror_pose
 from refu_core.weights import load_weights
-
-MAX_ASYMMETRY = 5e-3
-"""A template that is anywhere farther than this from its mirror image counts as asymmetric [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceMixture:
-    """Places on a garment: each lies in a triangle, and takes a weighted mean of the values at its three corners."""
-
-    corners: Tensor
-    """Vertices of the triangles, shape (P, 3), int64."""
-    weights: Tensor
-    """How much each corner counts, shape (P, 3)."""
-
-    @staticmethod
-    def nearest(
-        garment: GarmentTemplate, points: NDArray[np.float64]
-    ) -> tuple[SurfaceMixture, NDArray[np.float64], NDArray[np.float64]]:
-        """The places nearest to points (P, 3) [m]; their positions [m], (P, 3), and distances [m], (P,)."""
-        vertices, faces = garment.v_template.cpu().double().numpy(), garment.faces.cpu().numpy()
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        places, distance, triangle = trimesh.proximity.closest_point(mesh, points)
-        barycentrics = trimesh.triangles.points_to_barycentric(vertices[faces[triangle]], places)
-        return SurfaceMixture(torch.as_tensor(faces[triangle]), torch.as_tensor(barycentrics)), places, distance
-
-    def __call__(self, values: Tensor) -> Tensor:
-        """Values at the places, shape (B, P, K), from values at the garment's vertices (B, V, K)."""
-        weights = self.weights.to(values.dtype)
-        corners = (weights[:, k, None] * values[:, self.corners[:, k]] for k in range(3))
-        return sum(corners, start=torch.zeros(()))
-
-
-def mirror_pose(pose: Tensor) -> Tensor:
-    """The same pose in a mirror at x = 0: rotation vectors [rad], shape (B, 24, 3)."""
-    return pose[:, MIRRORED_JOINTS] * pose.new_tensor((1.0, -1.0, -1.0))
-
-
-@dataclass(frozen=True, eq=False)
-class Mirror:
-    """Where each vertex of a garment lies in its mirror image.
-
-    The garments' surfaces are symmetric, but their meshes aren't: a mirrored vertex lies in a triangle, and takes a
-    weighted mean of its three corners. The body and the bases of shape and style are symmetric, so β and γ stay.
-    """
-
-    image: SurfaceMixture
-
-    @staticmethod
-    def of(garment: GarmentTemplate) -> Mirror | None:
-        """The mirror image of a garment; None for one that isn't symmetric."""
-        mirrored = garment.v_template.cpu().double().numpy() * np.array((-1.0, 1.0, 1.0))
-        image, _, distance = SurfaceMixture.nearest(garment, mirrored)
-        return Mirror(image) if distance.max() <= MAX_ASYMMETRY else None
-
-    def displacement(self, displacement: Tensor) -> Tensor:
-        """Displacements of the mirrored garment, from `displacement`; both (B, V, 3) [m]."""
-        mixed = self.image(displacement)
-        return mixed * mixed.new_tensor((-1.0, 1.0, 1.0))
-
 
 _SPARE = 32
 """Extra components that a randomised decomposition finds: the last ones that it finds are the least accurate."""
@@ -139,12 +83,15 @@ class TrainingSet:
         body: SmplBody | None,
         *,
         who: Callable[[Tensor], Tensor] | None = None,
+        may_be_empty: bool = False,
     ) -> TrainingSet:
-        """Opens sets; the body is the garment's own if not given. Raises `RefuError` as `split`."""
+        """Opens sets; the body is the garment's own if not given. Raises `RefuError` as `read_samples`."""
         template = load_garment(garment) if isinstance(garment, str) else garment
         body = load_body(template.body) if body is None else body
         given = datasets if isinstance(datasets, Sequence) and not isinstance(datasets, str) else [datasets]
         sets = [open_dataset(one) if isinstance(one, (str, Path)) else one for one in given]
+        if not sets and not may_be_empty:
+            raise RefuError(f"wanted a set of {template.name}, got none: refu simulate {template.name} makes one")
         return cls(template, body, sets, _joined(sets, body, template, "train", who))
 
     def test(self, *, who: Callable[[Tensor], Tensor] | None = None) -> TrainingSamples:
@@ -263,7 +210,10 @@ def _joined(
 ) -> TrainingSamples:
     """The samples of a split of all sets, any of which may lack it; each pair keeps a number of its own."""
     if not sets:
-        raise RefuError(f"wanted a set of {garment.name}, got none: refu simulate {garment.name} makes one")
+        none = torch.zeros(0)
+        shapes = (N_JOINTS, 3), (N_BETAS,), (N_STYLES,), (garment.n_vertices, 3), ()
+        pose, betas, style, displacement, pair = (none.new_zeros(0, *shape) for shape in shapes)
+        return TrainingSamples(pose, betas, style, displacement, pair.long())
     for one in sets:
         check_set(one, body, garment)
     having = [one for one in sets if (one.train if split == "train" else one.test).any()] or sets[:1]

@@ -19,7 +19,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._rehearsal import Rehearsal, plans_of
+from refu_core.training._rehearsal import Rehearsal, plans_of, said_by
 from refu_core.weights import load_weights
 
 MANY = 4000
@@ -94,7 +94,7 @@ def pretrain(
     Args:
         garment: name of a built-in garment, or a template.
         datasets: simulated set (`refu simulate`), of garments at rest or of sequences; or several of plans with
-            different seeds. Pivots are those of the first.
+            different seeds. Pivots are those of the first. None to learn from what is rehearsed alone.
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`.
@@ -112,7 +112,7 @@ def pretrain(
         RefuError: the set is of another garment or body or too small, or a checkpoint there is of another training.
         WeightsError: no such backbone or preset, or files in `output` are damaged or of another garment.
     """
-    opened = data.TrainingSet.of(garment, datasets, body)
+    opened = data.TrainingSet.of(garment, datasets, body, may_be_empty=rehearsal is not None)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     test = opened.test()  # a missing test split is reported first
     settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
@@ -128,7 +128,7 @@ def pretrain(
     train = data.with_mirrored(train, mirror)
     described = {**identity, "backbone": backbone, "preset": preset}
     described |= {"settings": asdict(settings), "samples": len(train)}
-    mean, stored = samples.displacement.mean(0), None
+    stored = None
     if start is None:
         config = nets.backbone_config(backbone, template, preset=preset) if config is None else config
         if settings.dropout is not None and isinstance(config, nets.TailorNetConfig):
@@ -144,8 +144,11 @@ def pretrain(
         described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
         if rehearsal is not None:
             known = [one["plan"] for one in opened.cards]
-            rehearsed = rehearsal.of(stored.card, model, known=known)
-            train = train.joined(rehearsed)
+            others = [load_weights(Path(one) / stem.name, expect=identity) for one in rehearsal.teachers]
+            networks = [model, *(nets.backbone_from_weights(other, template) for other in others)]
+            rehearsed = rehearsal.of(stored.card, said_by(networks, mirror), known=known)
+            train = train.joined(rehearsed) if len(train) else rehearsed
+            described["teachers"] = [other.card["sha256"] for other in others]
             described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card, known=known)}
             for net in _of_pose(model):
                 net.dropout = 0.0  # rehearsed targets have no noise: with dropout a T-shirt was off by 0.2 mm more
@@ -161,9 +164,10 @@ def pretrain(
         **described,
         "mode": mode,
         "datasets": opened.cards,
-        "knows_limbs": opened.knows_limbs,
-        "figures": data.backbone_figures(model, test, body, template, mean=mean),
+        "knows_limbs": opened.knows_limbs if stored is None or opened.sets else stored.card.get("knows_limbs", False),
     }
+    if opened.sets:
+        card["figures"] = data.backbone_figures(model, test, body, template, mean=samples.displacement.mean(0))
     if is_writer():
         refu = None if stored is None else refu_from_weights(stored)
         layer = None if refu is None else refu_tensors(refu, half=preset != "paper")

@@ -77,6 +77,18 @@ class TrainOptions:
         parse=cli.positive,
         metavar="N",
     )
+    further: int = setting(
+        0,
+        "ask about so many further bodies, drawn as those plans draw theirs",
+        parse=cli.positive,
+        metavar="N",
+    )
+    teachers: tuple[Path, ...] = setting(
+        (),
+        "folders of further weights of the garment, in commas: the mean of what all say is learnt",
+        parse=cli.in_paths,
+        metavar="A,B",
+    )
     motions: Path | None = setting(None, "the motions of those plans", parse=cli.in_path, metavar="DIR")
     input_axes: Axes = cli.axes_of("motions'", "z up, as ROS has it")
     fps: float | None = cli.rate_of_files()
@@ -104,9 +116,9 @@ def add(commands: Any) -> None:
         "--data",
         type=cli.in_path,
         nargs="+",
-        required=True,
+        default=(),
         metavar="DIR",
-        help="the garment's data set, or several of plans with different seeds",
+        help="the garment's data set, or several of plans with different seeds; none to learn from --rehearse alone",
     )
     cli.add_options(parser, TrainOptions)
     cli.add_common(parser, run)
@@ -116,7 +128,8 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
     needed = {} if args.network in BEYOND else {"motions": "rehearse", "rehearse": "start"}
-    cli.require_use(args, {"fps": "motions", **needed, "joints": "start"})
+    needed |= {"fps": "motions", "joints": "start", "further": "rehearse", "teachers": "rehearse"}
+    cli.require_use(args, needed)
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
     return cli.tell(args, training_table(card, options), card)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +20,10 @@ from refu_core.backbones import Mlp, MlpConfig, backbone_from_weights
 from refu_core.errors import RefuError, WeightsError
 from refu_core.simulation import Clip, SamplePlan, split_clips
 from refu_core.training import LoopSettings, PretrainSettings, Rehearsal, pretrain
+from refu_core.training._data import Mirror, mirror_pose
 from refu_core.training._pretrain import tell_of
-from refu_core.weights import Weights, load_weights
+from refu_core.training._rehearsal import _SEEDS_APART, said_by
+from refu_core.weights import Weights, load_weights, save_weights
 
 GARMENT = "short-pant-male"
 PLAN = SamplePlan(GARMENT, 60, pivots=4, recorded_share=0.0)
@@ -188,6 +192,65 @@ def test_learns_beyond_what_it_saw_and_forgets_less(first: Path, further: Path, 
                 float((network(known.betas, known.pose, known.style) - known.displacement).norm(dim=-1).mean())
             )
     assert drift[1] < 0.8 * drift[0]
+
+
+def test_further_bodies_are_drawn_as_the_plans_draw_theirs(first: Path) -> None:
+    stored = load_weights(first / "mlp-none")
+    network = backbone_from_weights(stored, load_garment(GARMENT))
+    known, more, many = (Rehearsal(7, further=count).of(stored.card, network) for count in (0, 30, 200))
+    assert (len(known), len(more), len(many)) == (7, 37, 207)
+    torch.testing.assert_close(more.pose[:7], known.pose)
+    assert len(torch.unique(many.pose.flatten(1), dim=0)) == 207
+    other = replace(PLAN, seed=PLAN.seed + _SEEDS_APART)
+    np.testing.assert_array_equal(more.pose[7], other.pose(0, 0, [])[0])
+
+
+def test_networks_and_their_mirror_images_teach_together(first: Path) -> None:
+    garment = load_garment(GARMENT)
+    network = backbone_from_weights(load_weights(first / "mlp-none"), garment)
+    mirror = Mirror.of(garment)
+    assert mirror is not None
+    betas, style, pose = torch.randn(5, 10), torch.zeros(5, 4), 0.3 * torch.randn(5, 24, 3)
+
+    def asymmetry(said: Callable[[Tensor, Tensor, Tensor], Tensor]) -> float:
+        turned = mirror.displacement(said(betas, mirror_pose(pose), style))
+        return float((turned - said(betas, pose, style)).norm(dim=-1).mean())
+
+    with torch.no_grad():
+        assert asymmetry(said_by([network], mirror)) < 0.1 * asymmetry(network)
+        both = said_by([network, lambda *_: torch.zeros(5, garment.n_vertices, 3)], None)(betas, pose, style)
+        torch.testing.assert_close(both, 0.5 * network(betas, pose, style))
+
+
+@pytest.mark.usefixtures("no_curves")
+def test_what_weights_know_is_learnt_without_samples(first: Path, tmp_path: Path) -> None:
+    """As from a teacher that was trained apart."""
+    garment, before = load_garment(GARMENT), load_weights(first / "mlp-none")
+    teacher = Path(shutil.copytree(first, tmp_path / "teacher"))
+    tensors = {name: value.clone() for name, value in before.tensors.items()}
+    tensors["backbone.net.layers.1.bias"] += 0.05
+    save_weights(teacher / "mlp-none", tensors, dict(before.card))
+    how: dict[str, Any] = {"backbone": "mlp", "settings": QUICK, "start": first, "quiet": True}
+    rehearsal = Rehearsal(40, further=60, teachers=[teacher])
+    card = pretrain(GARMENT, (), tmp_path / "taught", rehearsal=rehearsal, **how)
+    assert card["samples"] == 0
+    assert card["datasets"] == []
+    assert "figures" not in card
+    assert card["rehearsed"] == {"count": 100, "plans": [asdict(PLAN)]}
+    assert card["teachers"] == [load_weights(teacher / "mlp-none").card["sha256"]]
+    one, other, taught = (
+        backbone_from_weights(load_weights(folder / "mlp-none"), garment)
+        for folder in (first, teacher, tmp_path / "taught")
+    )
+    new = Rehearsal(1, further=50).of(before.card | {"seed": 9}, one)
+    with torch.no_grad():
+        wanted, got, was = (
+            network(new.betas, new.pose, new.style)
+            for network in (said_by([one, other], Mirror.of(garment)), taught, one)
+        )
+    assert (got - wanted).norm(dim=-1).mean() < 0.4 * (was - wanted).norm(dim=-1).mean()
+    with pytest.raises(RefuError, match="wanted a set"):
+        pretrain(GARMENT, (), tmp_path / "nothing", **how)
 
 
 def test_there_must_be_weights_to_rehearse(further: Path, tmp_path: Path) -> None:

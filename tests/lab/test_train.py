@@ -130,6 +130,12 @@ def test_motions_are_read_as_they_were_simulated(
     assert wanted in capsys.readouterr().err
 
 
+def test_a_set_or_weights_to_learn_from_are_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for further in ([], ["--start", str(tmp_path)], ["--network", "dynamics"]):
+        assert main(["train", GARMENT, "--output", str(tmp_path / "w"), "--quiet", *further]) == 2
+        assert "give --data, a set of refu simulate" in capsys.readouterr().err
+
+
 def test_the_networks_of_distances_learn_from_one_set(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
