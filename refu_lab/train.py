@@ -58,11 +58,9 @@ def _train(
     common["body"] = body
     given = template, datasets, options.folder
     motions = options.motions and load_clips(options.motions, axes=options.input_axes, fps=options.fps)
-    rehearsal = (
-        None
-        if options.rehearse is None
-        else training.Rehearsal(options.rehearse, motions, further=options.further, teachers=options.teachers)
-    )
+    rehearsal = None
+    if options.rehearse is not None:
+        rehearsal = training.Rehearsal(options.rehearse, motions, further=options.further)
     if options.network == "dynamics":
         common |= {"mode": options.mode, "like": options.like}
         moving = _seeded(training.DynamicsSettings(), options, **steps)
@@ -77,7 +75,7 @@ def _train(
         return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
     common |= {"backbone": options.backbone, "preset": options.preset}
     of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
-    count = sum(int(one.train.sum()) for one in datasets) or options.rehearse or 0
+    count = sum(int(one.train.sum()) for one in datasets) + (options.rehearse or 0) + options.further
     first = training.PretrainSettings.of(options.backbone, options.preset, samples=count)
     first = _seeded(first, options, **of_all)
     if options.start is not None:

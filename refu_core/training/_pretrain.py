@@ -19,7 +19,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._rehearsal import Rehearsal, plans_of, said_by
+from refu_core.training._rehearsal import Rehearsal, plans_of, symmetric
 from refu_core.weights import load_weights
 
 MANY = 4000
@@ -144,11 +144,9 @@ def pretrain(
         described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
         if rehearsal is not None:
             known = [one["plan"] for one in opened.cards]
-            others = [load_weights(Path(one) / stem.name, expect=identity) for one in rehearsal.teachers]
-            networks = [model, *(nets.backbone_from_weights(other, template) for other in others)]
-            rehearsed = rehearsal.of(stored.card, said_by(networks, mirror), known=known)
+            asked = model if mirror is None else symmetric(model, mirror)
+            rehearsed = rehearsal.of(stored.card, asked, known=known)
             train = train.joined(rehearsed) if len(train) else rehearsed
-            described["teachers"] = [other.card["sha256"] for other in others]
             described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card, known=known)}
             for net in _of_pose(model):
                 net.dropout = 0.0  # rehearsed targets have no noise: with dropout a T-shirt was off by 0.2 mm more

@@ -39,13 +39,11 @@ class Rehearsal:
     """The motions of those plans; None where they have drawn poses alone."""
     further: int = 0
     """Further bodies, drawn as those plans draw theirs: no simulation has seen them."""
-    teachers: Sequence[str | Path] = ()
-    """Folders of further weights of the garment. What is rehearsed is the mean of what all networks say."""
 
     def of(
         self, card: Mapping[str, Any], network: Asked, *, known: Sequence[Mapping[str, Any]] = ()
     ) -> TrainingSamples:
-        """The samples for a trained `network`, or a mean of several, and the card of its weights.
+        """The samples for a trained `network` and the card of its weights.
 
         At most as many as its plans have, and the further ones. The plans `known`, those of the new samples, are left
         out, since their truth is there.
@@ -90,17 +88,16 @@ def _further(plans: Sequence[SamplePlan], count: int) -> Iterator[tuple[SamplePl
         yield from _spread(others, count)
 
 
-def said_by(networks: Sequence[Network], mirror: Mirror | None) -> Asked:
-    """The mean of what networks say, and, for a garment with a mirror image, of what they say in the mirror.
+def symmetric(network: Network, mirror: Mirror) -> Asked:
+    """The mean of what a network says of a person, and of the mirrored one in the mirror.
 
-    Each network is wrong in ways of its own, also about a mirrored person: the mean is nearer to the truth.
+    It is wrong about the two in different ways, so the mean is nearer to the truth.
     """
 
     def mean(betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
-        said = [network(betas, pose, style) for network in networks]
-        if mirror is not None:
-            said += [mirror.displacement(network(betas, mirror_pose(pose), style)) for network in networks]
-        return torch.stack(said).mean(0)
+        said, turned = network(betas, pose, style), network(betas, mirror_pose(pose), style)
+        both: Tensor = 0.5 * (said + mirror.displacement(turned))
+        return both
 
     return mean
 

@@ -102,11 +102,6 @@ def between(low: float, high: float) -> Callable[[str], float]:
     return partial(_number, float, low=low, high=high)
 
 
-def in_paths(text: str) -> tuple[Path, ...]:
-    """`in_path` of each of `A,B`."""
-    return tuple(in_path(part) for part in text.split(","))
-
-
 def in_path(text: str) -> Path:
     """The path of something to read; its reader checks whether it exists."""
     try:

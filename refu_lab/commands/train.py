@@ -83,12 +83,6 @@ class TrainOptions:
         parse=cli.positive,
         metavar="N",
     )
-    teachers: tuple[Path, ...] = setting(
-        (),
-        "folders of further weights of the garment, in commas: the mean of what all say is learnt",
-        parse=cli.in_paths,
-        metavar="A,B",
-    )
     motions: Path | None = setting(None, "the motions of those plans", parse=cli.in_path, metavar="DIR")
     input_axes: Axes = cli.axes_of("motions'", "z up, as ROS has it")
     fps: float | None = cli.rate_of_files()
@@ -128,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
     from refu_lab.train import train, training_table
 
     needed = {} if args.network in BEYOND else {"motions": "rehearse", "rehearse": "start"}
-    needed |= {"fps": "motions", "joints": "start", "further": "rehearse", "teachers": "rehearse"}
+    needed |= {"fps": "motions", "joints": "start", "further": "rehearse"}
     cli.require_use(args, needed)
     options = TrainOptions(**cli.given(args, TrainOptions))
     card = train(options, progress=not args.quiet)
