@@ -212,7 +212,8 @@ MODULES = {
     _tracker: ("_WOUND", "_FASTEST", "_FITS", "_CLEAR", "_NEAR", "_FAR"),
 }
 """Numbers that aren't settings."""
-CASES = ("usual", "hard")
+CASES = {"usual": "zed38", "hard": "coco17"}
+"""Layouts of the keypoints, by case."""
 ABOUT_KEYPOINTS = """# Keypoints: what half and twice of each number do
 
 {count} frames at 30 Hz of {clips} clips of recorded motion, of a person who isn't of mean shape. By
@@ -238,11 +239,11 @@ class KeypointBench:
         self.joints = Skeleton(keypoint_layout("smpl24"), self.proportions)
         rng = np.random.default_rng(0)
         betas = 0.8 * rng.normal(size=10)
-        self.seen: dict[str, list[Followed]] = {}
-        for case, layout in (("usual", "zed38"), ("hard", "coco17")):
-            skeleton = Skeleton(keypoint_layout(layout), self.proportions)
-            self.seen[case] = [self._followed(skeleton, clip, betas, rng, is_hard=case == "hard") for clip in clips]
-        self.skeletons = {"usual": Skeleton(keypoint_layout("zed38"), self.proportions), "hard": skeleton}
+        self.skeletons = {case: Skeleton(keypoint_layout(name), self.proportions) for case, name in CASES.items()}
+        self.seen = {
+            case: [self._followed(skeleton, clip, betas, rng, is_hard=case == "hard") for clip in clips]
+            for case, skeleton in self.skeletons.items()
+        }
 
     def _followed(
         self,
