@@ -7,12 +7,13 @@ from collections.abc import Collection, Mapping
 from refu_core.body import SmplBody
 from refu_core.errors import MeshError, require_type
 from refu_core.garments import GarmentTemplate
-from refu_core.realtime import GarmentPipeline
 
 
 def require_pipeline(pipeline: object) -> None:
-    """Raises `MeshError` for anything but a pipeline."""
-    require_type(pipeline, GarmentPipeline, "a GarmentPipeline", error=MeshError)
+    """Raises `MeshError` for anything but a pipeline, or what stands in for one."""
+    # An output has garments and a body, too.
+    if isinstance(pipeline, Mapping) or not (hasattr(pipeline, "garments") and hasattr(pipeline, "body")):
+        raise MeshError(f"wanted a GarmentPipeline, got {type(pipeline).__name__}")
 
 
 def require_outfit(body: object, garments: object) -> None:
