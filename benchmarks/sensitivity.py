@@ -307,8 +307,7 @@ def write_keypoints(clips: list[Motion], folder: Path) -> None:
             shipped = getattr(module, name)
             for factor in (0.5, 2.0):
                 setattr(module, name, factor * shipped)
-                text = "" if isinstance(shipped, np.ndarray) else f"{shipped} "
-                value = f"{text}→ {factor * shipped}" if text else f"x {factor}"
+                value = f"x {factor}" if isinstance(shipped, np.ndarray) else f"{shipped} → {factor * shipped}"
                 rows.append([f"`{name}`", value, *map("{:.1f}".format, bench.measure(TrackerSettings()))])
             setattr(module, name, shipped)
     count = sum(len(person.frames) for person in bench.seen["usual"])

@@ -75,7 +75,7 @@ def _train(
         return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
     common |= {"backbone": options.backbone, "preset": options.preset}
     of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
-    count = sum(int(one.train.sum()) for one in datasets) + (options.rehearse or 0) + options.further
+    count = sum(int(one.train.sum()) for one in datasets) + (0 if rehearsal is None else rehearsal.most)
     first = training.PretrainSettings.of(options.backbone, options.preset, samples=count)
     first = _seeded(first, options, **of_all)
     if options.start is not None:

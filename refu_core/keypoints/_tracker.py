@@ -59,8 +59,8 @@ class KeypointTracker:
         layout = skeleton.layout
         joints, other = layout.joints, layout.mirrored
         has_side = other != np.arange(len(other))
-        self._sided_ones = np.flatnonzero(has_side)
-        self._limbs = [[np.flatnonzero(np.isin(joints, part) & has_side) for part in limb] for limb in _LIMBS]
+        self._with_a_side = np.flatnonzero(has_side)
+        self._parts = [[np.flatnonzero(np.isin(joints, part) & has_side) for part in limb] for limb in _OUTWARDS]
         power = [np.full(3, settings.push), np.full(3 * N_JOINTS, settings.twist), np.zeros(N_BETAS)]
         self._power = np.concatenate(power) / settings.smoothing**2
         self._offset = np.where(layout.is_joint, 0.0, settings.offset_noise)
@@ -250,9 +250,9 @@ class KeypointTracker:
             is_clear = before.max(initial=0.0) >= _NEAR**2 and after.sum() < _CLEAR * before.sum()
             return float(before.sum() - after.sum()) if is_clear else 0.0
 
-        of_limbs = [max(limb, key=gain) for limb in self._limbs]
+        of_limbs = [max(limb, key=gain) for limb in self._parts]
         # A limb of which little is seen is taken for exchanged where most of the person is.
-        found = [self._sided_ones] if gain(self._sided_ones) > sum(map(gain, of_limbs)) else of_limbs
+        found = [self._with_a_side] if gain(self._with_a_side) > sum(map(gain, of_limbs)) else of_limbs
         return [group for group in found if gain(group) > 0]
 
     # The filter -----------------------------------------------------------------------------------
@@ -316,7 +316,7 @@ def _wound(pose: Pose) -> float:
     return float(np.linalg.norm(log_so3(pose.turns[_SPINE]), axis=1).sum())
 
 
-_LIMBS = (
+_OUTWARDS = (
     ((16, 18, 20, 22, 17, 19, 21, 23), (18, 20, 22, 19, 21, 23), (20, 22, 21, 23)),
     ((1, 4, 7, 10, 2, 5, 8, 11), (4, 7, 10, 5, 8, 11), (7, 10, 8, 11)),
     ((15,),),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 import warp as wp
@@ -15,6 +13,9 @@ from refu_core.errors import FrameError, as_before_if_it_fails, require_type
 from refu_core.frames import SmplFrame
 from refu_core.observation._cloth import (
     DEFAULT_OBSERVATION,
+    F32,
+    F64,
+    Estimate,
     Measured,
     ObservationSettings,
     ObservedCloth,
@@ -155,21 +156,24 @@ class Observer:
             found = cloth.match(seen, self._skin_mesh, others, eye)
             self.matched[name] = len(found.say)
             slopes = cloth.slopes(found, blend)
-            noise, before = how.noise, numbers
-            for _ in range(2):  # what the fit leaves shows how noisy the points are
-                trust = found.say / (1 + (found.height / how.robust) ** 2) / noise**2
-                weighed = (slopes * trust[:, None]).T
-                information = (weighed @ slopes).astype(np.float64)
-                pull = weighed @ found.height + information @ before
-                numbers, after = estimate.updated(information, pull.astype(np.float64))
-                last, noise = noise, _noise(found.height - slopes @ (numbers - before), how.noise)
-                if noise == last:
-                    break
+            say, before = found.say / (1 + (found.height / how.robust) ** 2), numbers
+            numbers, after = _fitted(estimate, slopes, found.height, before, say / how.noise**2)
+            noise = _noise(found.height - slopes @ (numbers - before), how.noise)
+            if noise > how.noise:
+                numbers, after = _fitted(estimate, slopes, found.height, before, say / noise**2)
             cloth.draw(numbers)
         estimate.take(numbers, after)
 
 
-def _noise(height: NDArray[np.floating[Any]], least: float) -> float:
+def _fitted(estimate: Estimate, slopes: F32, height: F32, numbers: F64, trust: NDArray[np.floating]) -> tuple[F64, F64]:
+    """Mean and precision of the numbers, once heights [m] are measured where they are `numbers`; `trust` [m⁻²]."""
+    weighed = (slopes * trust[:, None]).T
+    information = (weighed @ slopes).astype(np.float64)
+    pull = weighed @ height + information @ numbers
+    return estimate.updated(information, pull.astype(np.float64))
+
+
+def _noise(height: NDArray[np.floating], least: float) -> float:
     """Standard deviation of heights that a fit leaves [m], (M,), `least` at least.
 
     Cells come in the order of their places, so one after the other is mostly a neighbour, which a garment that is off

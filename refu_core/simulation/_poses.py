@@ -16,11 +16,11 @@ from refu_core.frames import N_JOINTS
 from refu_core.recordings import SUFFIXES, Axes, interpolated, is_named_as_motion, n_resampled, read_recording
 from refu_core.skeleton import JOINT_NAMES, posed
 
+_SHOWN = 3
+"""How many files an error lists beside the first one."""
 # Range of each joint's rotation vector [degrees] about x, y, z, for the left side where there are two; the right side
 # is its mirror image. x points to the subject's left, y up, z forward, so a thigh is raised by a negative turn about x,
 # an arm lowered by a negative turn about z, an elbow bent by a negative turn about y.
-_SHOWN = 3
-"""How many files an error lists beside the first one."""
 _LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
     0: ((-15, 25), (0, 0), (-10, 10)),
     1: ((-85, 20), (-20, 20), (-5, 25)),

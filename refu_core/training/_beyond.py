@@ -81,7 +81,7 @@ def train_beyond(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.loop.seed)
         beyond = nets.Beyond(kind, nets.BeyondConfig(known.config.joints), decoder)
-    rehearsed = rehearsal.of(card_of_known, known, known=[one["plan"] for one in opened.cards])
+    rehearsed = rehearsal.of(card_of_known, known, known=opened.plans)
     rehearsed = rehearsed.take(who(rehearsed.pose))
     owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
     parts = [

@@ -92,6 +92,8 @@ class TrainingSet:
         sets = [open_dataset(one) if isinstance(one, (str, Path)) else one for one in given]
         if not sets and not may_be_empty:
             raise RefuError(f"wanted a set of {template.name}, got none: refu simulate {template.name} makes one")
+        for one in sets:
+            check_set(one, body, template)
         return cls(template, body, sets, _joined(sets, body, template, "train", who))
 
     def test(self, *, who: Callable[[Tensor], Tensor] | None = None) -> TrainingSamples:
@@ -121,6 +123,11 @@ class TrainingSet:
         return found, stored.card
 
     @property
+    def plans(self) -> list[Mapping[str, Any]]:
+        """The plan of each set."""
+        return [one.card.get("plan", {}) for one in self.sets]
+
+    @property
     def n_slots(self) -> int:
         """Rows of all sets, finished or not."""
         return sum(map(len, self.sets))
@@ -128,7 +135,7 @@ class TrainingSet:
     @property
     def n_pivots(self) -> int:
         """How many pairs of the first plan have many poses each. Raises `RefuError` where its card doesn't say."""
-        found = self.sets[0].card["plan"].get("pivots", SamplePlan.pivots)
+        found = self.plans[0].get("pivots", SamplePlan.pivots)
         if not isinstance(found, int) or found < 1:
             raise RefuError(f"wanted the number of its pivots in the set's card (plan.pivots), got {str(found)[:80]}")
         return found
@@ -214,8 +221,6 @@ def _joined(
         shapes = (N_JOINTS, 3), (N_BETAS,), (N_STYLES,), (garment.n_vertices, 3), ()
         pose, betas, style, displacement, pair = (none.new_zeros(0, *shape) for shape in shapes)
         return TrainingSamples(pose, betas, style, displacement, pair.long())
-    for one in sets:
-        check_set(one, body, garment)
     having = [one for one in sets if (one.train if split == "train" else one.test).any()] or sets[:1]
     numbered, count = [], 0
     for one in having:

@@ -115,7 +115,8 @@ def pretrain(
     opened = data.TrainingSet.of(garment, datasets, body, may_be_empty=rehearsal is not None)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     test = opened.test()  # a missing test split is reported first
-    settings = PretrainSettings.of(backbone, preset, samples=len(samples)) if settings is None else settings
+    most = len(samples) + (0 if rehearsal is None else rehearsal.most)
+    settings = PretrainSettings.of(backbone, preset, samples=most) if settings is None else settings
     if start is None and (rehearsal is not None or joints or mode != "none"):
         raise RefuError("there is nothing to go on from or to rehearse without weights to start from")
     torch_device, output = start_parallel(device), Path(output)
@@ -143,11 +144,10 @@ def pretrain(
         config = model.config
         described |= {"goes_on_from": stored.card["sha256"], "refu": stored.card.get("refu")}
         if rehearsal is not None:
-            known = [one["plan"] for one in opened.cards]
             asked = model if mirror is None else symmetric(model, mirror)
-            rehearsed = rehearsal.of(stored.card, asked, known=known)
+            rehearsed = rehearsal.of(stored.card, asked, known=opened.plans)
             train = train.joined(rehearsed) if len(train) else rehearsed
-            described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card, known=known)}
+            described["rehearsed"] = {"count": len(rehearsed), "plans": plans_of(stored.card, known=opened.plans)}
             for net in _of_pose(model):
                 net.dropout = 0.0  # rehearsed targets have no noise: with dropout a T-shirt was off by 0.2 mm more
         if joints:

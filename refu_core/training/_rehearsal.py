@@ -40,6 +40,11 @@ class Rehearsal:
     further: int = 0
     """Further bodies, drawn as those plans draw theirs: no simulation has seen them."""
 
+    @property
+    def most(self) -> int:
+        """Bodies at most."""
+        return self.count + self.further
+
     def of(
         self, card: Mapping[str, Any], network: Asked, *, known: Sequence[Mapping[str, Any]] = ()
     ) -> TrainingSamples:
