@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -88,9 +88,9 @@ class FittedGarment:
     """A garment, and what was done to the mesh."""
 
     template: GarmentTemplate
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
     """What was found out about the mesh and changed in it, one sentence each."""
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str]
     """Reasons why it may not be worn as it was meant, one sentence each; empty if there are none."""
 
 
@@ -330,7 +330,8 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     ends = np.concatenate((np.arange(len(v)).repeat(2).reshape(-1, 2), edges))  # a vertex, as the middle of no edge
     lacks, asked = np.zeros((len(ends), 3)), np.ones(len(ends), np.bool_)
     for _ in range(_ROUNDS):
-        lacks[asked] = _shortfall(v[ends[asked]].mean(1), body)
+        distance, away = body(v[ends[asked]].mean(1))
+        lacks[asked] = np.maximum(CLEARANCE - distance, 0)[:, None] * away
         lift, middles = lacks[: len(v)], lacks[len(v) :]
         order = np.argsort(np.linalg.norm(middles, axis=1))
         for end in (0, 1):
@@ -356,11 +357,6 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
             f"skin, by {1e3 * moved.max():.0f} mm at most"
         )
     return v
-
-
-def _shortfall(points: F64, body: PosedBody) -> F64:
-    distance, gradient = body(points)
-    return np.maximum(CLEARANCE - distance, 0)[:, None] * gradient
 
 
 def _larger(a: F64, b: F64) -> F64:

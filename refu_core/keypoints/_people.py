@@ -45,11 +45,10 @@ class People:
 
         Stamps that haven't advanced for `hold` say nothing; the time at which messages come is then used instead.
         """
-        one = self._people.pop(person, None)
+        one = self._people.get(person)
         if one is None:
             track = KeypointTracker(self.skeleton, betas=self._betas, settings=self._settings)
             one = _Person(track, stamp_ns, now_ns, now_ns)
-        self._people[person] = one
         one.went_on_ns = now_ns if stamp_ns > one.last_ns else min(one.went_on_ns, now_ns)
         one.last_ns = stamp_ns
         if 1e-9 * (now_ns - one.went_on_ns) > self._settings.hold:
@@ -58,6 +57,8 @@ class People:
         frame = one.track.update(points, stamp_ns, confidence=confidence)
         if one.track.stamp_ns != before:  # otherwise they were older than those that are known
             one.newest_ns, one.came_ns = stamp_ns, now_ns
+        self._people.pop(person, None)
+        self._people[person] = one  # the newest is the last
         for gone in list(self._people)[:-MOST_PEOPLE]:
             del self._people[gone]
         return frame

@@ -166,7 +166,7 @@ class KeypointTracker:
         guess = self._guessed(seen)
         if guess is None:
             return None
-        self._take(*guess)
+        self._take(guess)
         self._stamp = self._seen_at = stamp_ns
         return self.at(stamp_ns)
 
@@ -187,10 +187,10 @@ class KeypointTracker:
         # What the tracker says is believed unless the mirror image fits much better: most people are symmetric.
         return found[1] if len(found) == 2 and found[1][2] < 0.5 * found[0][2] else found[0]
 
-    def _take(self, pose: Pose, variance: Array, _: float) -> None:
-        self._is_here, self._pose = True, pose
+    def _take(self, guess: tuple[Pose, Array, float]) -> None:
+        self._is_here = True
+        self._pose, self._variance, _ = guess
         self._rate = np.zeros(N_PARTS)
-        self._variance = variance
         self._mixed = np.zeros(N_PARTS)
         self._rate_variance = np.concatenate([np.full(3, 1.0), np.full(3 * N_JOINTS, 4.0), np.zeros(N_BETAS)])
         self._swapped_for = self._unfit_for = 0.0
@@ -200,14 +200,14 @@ class KeypointTracker:
         self._swapped_for = self._unfit_for = 0.0
         guess = self._guessed(seen)
         if guess is not None and guess[2] < 0.7 * self._misfit(self._pose, seen):
-            self._take(*guess)
+            self._take(guess)
 
     def _unwind(self, seen: _Seen) -> None:
         """Starts again from this frame alone if a spine is wound up, as after a cut at which somebody turned."""
         wound = _wound(self._pose)
         guess = self._guessed(seen) if wound > _WOUND else None
         if guess is not None and _wound(guess[0]) < wound:
-            self._take(*guess)
+            self._take(guess)
 
     def _misfit(self, pose: Pose, seen: _Seen) -> float:
         """Root mean square distance of keypoints from where the pose has them, each at most 0.5 [m]."""

@@ -177,7 +177,7 @@ class CollisionChecker(Unpicklable):
         """
         self._body = ExactSdf(body_faces)
         self._winding = Winding(self._body.faces)
-        self._triangles: dict[tuple[int, int], Triangles] = {}
+        self._triangles: dict[tuple[int, tuple[int, ...]], Triangles] = {}
 
     def update(self, body_vertices: Any) -> None:
         """Takes over a new pose: the body's vertices [m], shape (V, 3). Raises `MeshError` as `ExactSdf.update`."""
@@ -202,7 +202,7 @@ class CollisionChecker(Unpicklable):
 
     def _triangles_of(self, faces: Any, vertices: NDArray[np.float32]) -> Triangles:
         # The same few garments come frame after frame: comparing faces is a tenth of the work of preparing them.
-        size = (len(vertices), len(faces))
+        size = (len(vertices), np.shape(faces))
         known = self._triangles.get(size)
         if known is None or not np.array_equal(known.faces, faces):
             checked = Connectivity.of(faces, len(vertices)).faces

@@ -249,21 +249,16 @@ class ObservedCloth:
         self._points.copy_(torch.from_numpy(vertices))
         self._mesh.refit()
 
-    @property
-    def tree(self) -> int:
-        """Warp's handle of the mesh of the garment where it is."""
-        return int(self._mesh.id)
-
     def match(
-        self, measured: Measured, skin: wp.Mesh, others: Sequence[int], eye: NDArray[np.float64] | None
+        self, measured: Measured, skin: wp.Mesh, others: Sequence[ObservedCloth], eye: NDArray[np.float64] | None
     ) -> Matches:
-        """Which of the points are the cloth's, not those of other garments (trees `others`), and where on it."""
+        """Which of the points are the cloth's, not those of `others`, and where on it."""
         how = self._settings
         own = self._points.numpy()
         rows = np.flatnonzero(within(measured.points, own.min(0) - how.reach, own.max(0) + how.reach))
         points = wp.array(measured.points[rows], dtype=wp.vec3, device="cpu")
         seen = wp.vec3() if eye is None else wp.vec3(*eye.tolist())
-        trees = wp.array(np.array(others, np.uint64), dtype=wp.uint64, device="cpu")
+        trees = wp.array(np.array([other._mesh.id for other in others], np.uint64), dtype=wp.uint64, device="cpu")
         inputs = [points, self._mesh.id, skin.id, trees, self._rim, how.reach, how.slack, eye is not None, seen]
         outputs = [wp.empty(len(rows), dtype=kind, device="cpu") for kind in (wp.int32, wp.vec3, wp.vec3, wp.float32)]
         wp.launch(match_kernel, len(rows), inputs, outputs, device="cpu")

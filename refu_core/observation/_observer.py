@@ -152,7 +152,7 @@ class Observer:
         for round_ in range(1 if estimate.is_informed else how.first_rounds):
             if round_:
                 cloth.place(predicted + _posed(blend, cloth.offset))
-            others = [other.tree for other in self._cloths.values() if other is not cloth]
+            others = [other for other in self._cloths.values() if other is not cloth]
             found = cloth.match(seen, self._skin_mesh, others, eye)
             self.matched[name] = len(found.say)
             slopes = cloth.slopes(found, blend)

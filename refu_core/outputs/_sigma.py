@@ -281,5 +281,4 @@ def _right_jacobians(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     square = np.maximum(angle, 1e-3) ** 2
     first = np.where(angle < 1e-3, 0.5, (1 - np.cos(angle)) / square)
     second = np.where(angle < 1e-3, 1 / 6, (angle - np.sin(angle)) / (square * np.maximum(angle, 1e-3)))
-    found: NDArray[np.float64] = np.eye(3) - first * cross + second * (cross @ cross)
-    return found
+    return np.eye(3) - first * cross + second * (cross @ cross)

@@ -63,10 +63,11 @@ class PinholeCamera:
             )
         )
         is_turn = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
-        if min(*focal, *size) <= 0 or not is_turn:
+        if min(*focal, *size) <= 0 or (size % 1).any() or not is_turn:
             wanted = "a camera has a size in pixels, positive focal lengths and a rotation that isn't a mirror"
             raise MeshError(f"{wanted}, got {self.width} x {self.height}, {self.focal} and {rotation.tolist()}")
-        vars(self).update(rotation=rotation, translation=translation)
+        width, height = map(int, size)
+        vars(self).update(width=width, height=height, rotation=rotation, translation=translation)
 
     @classmethod
     def looking_at(

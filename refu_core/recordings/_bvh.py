@@ -141,7 +141,7 @@ def _placed(joints: list[_Joint], rows: Array) -> tuple[Array, Array]:
     for i, joint in enumerate(joints):
         own = rows[:, start : start + len(joint.channels)]
         start += len(joint.channels)
-        way, order = np.broadcast_to(joint.offset, (len(rows), 3)).copy(), ""
+        way, order = np.tile(joint.offset, (len(rows), 1)), ""
         angles: list[Array] = []
         for name, column in zip(joint.channels, own.T, strict=True):
             kind, axis = _CHANNELS[name]
@@ -149,12 +149,9 @@ def _placed(joints: list[_Joint], rows: Array) -> tuple[Array, Array]:
                 way[:, axis] = column
             else:
                 order, angles = order + "XYZ"[axis], [*angles, column]
-        if order and len(set(order)) == len(order):
-            turn = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True).as_matrix()
-        elif order:
+        if len(set(order)) < len(order):
             raise ValueError(f"{joint.name} turns twice about one axis: {order}")
-        else:
-            turn = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+        turn = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True).as_matrix() if order else np.eye(3)
         if joint.parent < 0:
             places[i], turns[i] = way, turn
         else:

@@ -77,8 +77,8 @@ def follow(
     poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
     transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
     pelvis = known_body.of(betas.astype(np.float64))[0]
-    roots, transl = to_smpl(poses[:, 0].astype(np.float64), transl, axes, notes, usual=usual, pelvis=pelvis)
-    poses[:, 0] = roots
+    roots = poses[:, 0].astype(np.float64)
+    poses[:, 0], transl = to_smpl(roots, transl, axes, notes, usual=usual, pelvis=pelvis)
     tell_pace(transl, fps, notes, has_unit=True)
     is_fitted = worn is not None
     return Recording(

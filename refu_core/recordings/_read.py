@@ -177,11 +177,8 @@ def _recording(
         notes.append("SMPL-X's mesh has its pelvis 13 cm lower than SMPL's: translations are changed by that")
     poses, transl = filled(poses, transl, numbers(n), notes)
     of_amass = n_joints in (_SMPLH_JOINTS, _SMPLX_JOINTS) and first(above, table.RATES[:2]) is not None
-    roots = poses[:, 0].astype(np.float64)
     usual: Axes = "z-up" if of_amass else "smpl"
-    roots, transl = to_smpl(roots, transl, axes, notes, usual=usual, pelvis=pelvis)
-    if axes != "frame":
-        poses[:, 0] = roots
+    poses[:, 0], transl = to_smpl(poses[:, 0], transl, axes, notes, usual=usual, pelvis=pelvis)
     hertz = rate()
     tell_pace(transl, hertz, notes)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes inf or NaN, which the frame refuses

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,7 @@ class Recording:
     """Frames a second."""
     gender: str = "neutral"
     """male, female or neutral: which shape space the betas belong to."""
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     """What was assumed, left out or turned: one sentence each, to be shown to whoever supplied the file."""
     is_fitted: bool = False
     """Whether the betas were fitted to the body that will be dressed, and so are in its own shape space."""

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.frames import N_BETAS
 from refu_core.keypoints import Proportions, layout_of
+from refu_core.recordings._rotations import unit
 from refu_core.recordings._upright import Array
 from refu_core.skeleton import JOINT_NAMES
 
@@ -136,14 +137,14 @@ class _Turned:
         top = source.points.get("neck", source.points.get("head", chest))
         low = (source.rest[source.points["l_hip"]] + source.rest[source.points["r_hip"]]) / 2
         lower, upper = source.rest[chest] - low, source.rest[top] - source.rest[chest]
-        up, is_straight = _unit(lower + upper), top == chest or _unit(lower) @ _unit(upper) > _STRAIGHT
+        up, is_straight = unit(lower + upper), top == chest or unit(lower) @ unit(upper) > _STRAIGHT
         if is_straight and np.abs(up).max() > _ALIGNED:
             up, upright = np.sign(up) * (np.abs(up) == np.abs(up).max()), np.array([0.0, 1.0, 0.0])
         own = _axes(np.array([1.0, 0.0, 0.0]), upright)
         ups = [up if is_straight else _mean_in(turn, along) for turn in turns]
         trunk = [turn @ _axes(x, y) @ own.T for turn, x, y in zip(turns, lefts, ups, strict=True)]
-        alike = [(axes[:, :, 0] * _unit(way)).sum(1).mean() for axes, way in zip(trunk, across, strict=True)]
-        alike += [(axes @ own[:, 1] * _unit(along)).sum(1).mean() for axes in trunk]
+        alike = [(axes[:, :, 0] * unit(way)).sum(1).mean() for axes, way in zip(trunk, across, strict=True)]
+        alike += [(axes @ own[:, 1] * unit(along)).sum(1).mean() for axes in trunk]
         if not min(alike) > _TURNED:
             return None
         faces_ahead = is_straight and lefts[0] @ lefts[1] > _ALIKE
@@ -181,7 +182,7 @@ def retargeted(source: SourceSkeleton, body: Proportions) -> tuple[Array, dict[s
             if f"{side}_{a}" in found and f"{side}_{b}" in source.points:
                 length = np.linalg.norm(joint[f"{name}_{b}"] - joint[f"{name}_{a}"])
                 way = source.at(f"{side}_{b}") - source.at(f"{side}_{a}")
-                found[f"{side}_{b}"] = found[f"{side}_{a}"] + length * _unit(way)
+                found[f"{side}_{b}"] = found[f"{side}_{a}"] + length * unit(way)
     if "head" in source.points:
         found["head"] = found["neck"] + turned.neck @ (joint["head"] - joint["neck"])
         for name, offset in zip(_FACE, layout_of("", _FACE).offsets, strict=True):
@@ -199,19 +200,14 @@ def _shoulder(source: SourceSkeleton, turned: _Turned, side: str, start: Array, 
     shrug = np.einsum("tij,tj->ti", turns, seen - np.median(seen, axis=0))
     off = np.median(_inside(turned.chest, shoulder - start), axis=0) - collar
     own = collar + off * min(1.0, _SAME / max(float(np.linalg.norm(off)), _SAME))
-    end: Array = start + np.linalg.norm(collar) * _unit(turned.chest @ own + shrug)
+    end: Array = start + np.linalg.norm(collar) * unit(turned.chest @ own + shrug)
     return end
-
-
-def _unit(way: Array) -> Array:
-    unit: Array = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
-    return unit
 
 
 def _axes(left: Array, up: Array) -> Array:
     """Axes (3, 3), one a column: to the left, up as far as that allows, and forward."""
-    x = _unit(left)
-    y = _unit(up - (up @ x) * x)
+    x = unit(left)
+    y = unit(up - (up @ x) * x)
     return np.stack((x, y, np.cross(x, y)), axis=1)
 
 
@@ -222,10 +218,9 @@ def _inside(turns: Array, ways: Array) -> Array:
 
 
 def _mean_in(turns: Array, ways: Array) -> Array:
-    return _unit(_inside(turns, _unit(ways)).mean(axis=0))
+    return unit(_inside(turns, unit(ways)).mean(axis=0))
 
 
 def _mean_turn(turns: Array, axes: Array) -> Array:
     """The rotation (3, 3) that brings `turns` nearest to `axes`, both (T, 3, 3), on average."""
-    mean: Array = Rotation.from_matrix(turns.swapaxes(1, 2) @ axes).mean().as_matrix()
-    return mean
+    return Rotation.from_matrix(turns.swapaxes(1, 2) @ axes).mean().as_matrix()

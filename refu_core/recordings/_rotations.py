@@ -203,11 +203,15 @@ def _unevenness(a: Array, b: Array) -> float:
 
 def _completed(a: Array, b: Array) -> Array:
     """Matrices whose first two columns are nearest to a and b, shapes (..., 3), by Gram-Schmidt."""
-    tiny = 1e-12
-    x = a / np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), tiny)
-    b = b - (x * b).sum(axis=-1, keepdims=True) * x
-    y = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), tiny)
+    x = unit(a)
+    y = unit(b - (x * b).sum(axis=-1, keepdims=True) * x)
     return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors (..., 3) with a length of 1; zero stays zero."""
+    found: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    return found
 
 
 def flexion_of(vectors: NDArray[Any], *, first: int) -> float:

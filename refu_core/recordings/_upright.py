@@ -47,8 +47,7 @@ def _are_sound(roots: Array) -> NDArray[np.bool_]:
 
 def up_of_root(roots: Array) -> Array:
     """The body's upward directions, shape (T, 3), for root rotation vectors [rad], shape (T, 3)."""
-    up: Array = Rotation.from_rotvec(roots).apply([0.0, 1.0, 0.0])
-    return up.reshape(-1, 3)
+    return Rotation.from_rotvec(roots).apply([0.0, 1.0, 0.0])
 
 
 def upright_share(roots: Array) -> float:
@@ -78,7 +77,7 @@ def turn_from(up: Array) -> Array:
 
 
 def to_smpl(
-    roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual: Axes, pelvis: Array = PELVIS
+    roots: Array, transl: Array, axes: Axes, notes: list[str], *, usual: Axes, pelvis: Array
 ) -> tuple[Array, Array]:
     """Roots [rad] and translations [m], shapes (T, 3), in SMPL's axes.
 

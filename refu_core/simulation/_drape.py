@@ -262,8 +262,7 @@ class Draper:
         transforms = self.body(self._comfort, shape).transforms
         posed = self.garment.pose(torch.from_numpy(rest).expand(len(self._comfort), -1, -1), transforms).numpy()
         body_rest = self.body.rest_vertices(shape)[0].numpy()
-        self._sdf.update(torch.from_numpy(body_rest))
-        self._sdf.rebuild()
+        self.rebuild(body_rest)
         *eased, crook = posed
         self.cloth.start(rest, positions, eased=eased, crooks=[crook], waist=self._waist, body_rest=body_rest)
         self.rebuild(body)

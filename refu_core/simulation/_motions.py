@@ -114,8 +114,7 @@ def synthetic_motion(clips: Sequence[Clip], n_frames: int, rng: np.random.Genera
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    smooth: NDArray[np.float64] = gaussian_filter1d(values, _ROUNDED * RATE, axis=0, mode="nearest")
-    return smooth
+    return gaussian_filter1d(values, _ROUNDED * RATE, axis=0, mode="nearest")
 
 
 def _facing_forward(

@@ -100,16 +100,13 @@ def load_clips(path: str | Path, *, axes: Axes = "auto", fps: float | None = Non
     return clips
 
 
-def as_clips(motions: str | Path | Sequence[Clip]) -> list[Clip]:
-    """The given clips, or those loaded from a file or folder. Raises as `load_clips`."""
-    return load_clips(motions) if isinstance(motions, (str, Path)) else list(motions)
-
-
-def split_clips(clips: Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
+def split_clips(motions: str | Path | Sequence[Clip]) -> tuple[list[Clip], list[Clip]]:
     """Train and test clips: in order of name, every fifth from the second on is kept whole for the test.
 
-    Raises `SimulationError` for fewer than two clips, which can't be split.
+    Instead of clips, a file or folder of them may be given. Raises `SimulationError` as `load_clips`, and for fewer
+    than two clips, which can't be split.
     """
+    clips = load_clips(motions) if isinstance(motions, (str, Path)) else motions
     if len(clips) < 2:
         raise SimulationError(f"wanted two motions or more, to keep whole ones for the test; got {len(clips)}")
     ordered = sorted(clips, key=lambda clip: clip.name)

@@ -21,7 +21,7 @@ from refu_core.errors import SimulationError
 from refu_core.frames import N_JOINTS
 from refu_core.simulation import _store as store
 from refu_core.simulation._plan import TEST, TRAIN, SamplePlan
-from refu_core.simulation._poses import POSTURES, Clip, as_clips, split_clips
+from refu_core.simulation._poses import POSTURES, Clip, split_clips
 from refu_core.simulation._worker import SimulationSettings, Simulator, SlotSimulator
 
 
@@ -224,7 +224,7 @@ def simulate_dataset(
     another run is writing, and processes that were killed again and again (what is finished is kept); `MeshError` for a
     body that isn't watertight; `BodyError` or `GarmentError` for no such body or garment.
     """
-    clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(as_clips(motions))
+    clips: tuple[list[Clip], list[Clip]] = ([], []) if motions is None else split_clips(motions)
     if motions is None:
         plan["recorded_share"] = 0.0
     slots = SamplePlan(garment, count, **({"postures": tuple(POSTURES)} | plan))

@@ -21,7 +21,7 @@ from refu_core.simulation._cloth import F32
 from refu_core.simulation._drape import GRAVITY
 from refu_core.simulation._motions import STEPS, DrawnMotion, recorded_motion, synthetic_motion
 from refu_core.simulation._plan import TEST, TRAIN, names_of, truncated_normal
-from refu_core.simulation._poses import Clip, as_clips, split_clips
+from refu_core.simulation._poses import Clip, split_clips
 from refu_core.simulation._produce import Progress, produce
 from refu_core.simulation._store import CAUSES, DONE, FPS, GOT_THROUGH, SEQUENCES
 from refu_core.simulation._worker import SimulationSettings, Simulator, is_lost
@@ -242,5 +242,5 @@ def simulate_sequences(
     slots = SequencePlan(garment, count, **plan)
     if motions is None:
         raise SimulationError(f"sequences need recorded motion: give a folder of files of {slots.seconds:g} s or more")
-    given = slots, split_clips(as_clips(motions)), settings or SequenceSettings(), body
+    given = slots, split_clips(motions), settings or SequenceSettings(), body
     return produce(SequenceSimulator, *given, output=output, engine=engine, progress=progress, fps=FPS)

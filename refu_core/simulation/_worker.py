@@ -37,7 +37,6 @@ class Selector:
     def __init__(self, body_faces: Any, garment_faces: Any, *, settings: SelectionSettings | None = None) -> None:
         """For a garment on a body, faces of the shape (F, 3) each."""
         self.settings = settings or SelectionSettings()
-        self._garment_faces = np.ascontiguousarray(garment_faces, dtype=np.int32)
         self._body = CollisionChecker(body_faces)
         self._itself = SheetChecker(garment_faces)
 
@@ -48,7 +47,7 @@ class Selector:
         `stretch` and `speed` are those of `SettledDrape`.
         """
         self._body.update(body)
-        if not self._body.check(vertices, self._garment_faces).is_free:
+        if not self._body.check(vertices, self._itself.faces).is_free:
             return "body_collision"
         self._itself.update(vertices)
         if len(self._itself.with_itself()):

@@ -281,8 +281,7 @@ class _Remainder:
 
     def _kernel(self, inputs: Tensor) -> Tensor:
         distance = 3**0.5 / self._settings.length * torch.cdist(inputs, self._known)
-        kernel: Tensor = (1 + distance) * torch.exp(-distance)
-        return kernel
+        return (1 + distance) * torch.exp(-distance)
 
 
 Bodies = tuple[Tensor, Tensor, Tensor]

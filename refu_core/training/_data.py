@@ -209,17 +209,12 @@ def read_samples(
 
 
 def _joined(
-    sets: Sequence[Rows],
-    body: SmplBody,
-    garment: GarmentTemplate,
-    split: str,
-    who: Callable[[Tensor], Tensor] | None,
+    sets: Sequence[Rows], body: SmplBody, garment: GarmentTemplate, split: str, who: Callable[[Tensor], Tensor] | None
 ) -> TrainingSamples:
     """The samples of a split of all sets, any of which may lack it; each pair keeps a number of its own."""
     if not sets:
-        none = torch.zeros(0)
         shapes = (N_JOINTS, 3), (N_BETAS,), (N_STYLES,), (garment.n_vertices, 3), ()
-        pose, betas, style, displacement, pair = (none.new_zeros(0, *shape) for shape in shapes)
+        pose, betas, style, displacement, pair = (torch.zeros(0, *shape) for shape in shapes)
         return TrainingSamples(pose, betas, style, displacement, pair.long())
     having = [one for one in sets if (one.train if split == "train" else one.test).any()] or sets[:1]
     numbered, count = [], 0

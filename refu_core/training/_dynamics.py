@@ -25,7 +25,7 @@ from refu_core.errors import RefuError
 from refu_core.frames import SmplFrame
 from refu_core.garments import GarmentTemplate, load_garment
 from refu_core.history import PoseHistory
-from refu_core.simulation import GarmentDataset, GarmentSequences
+from refu_core.simulation import GarmentSequences
 from refu_core.training import _data as data
 from refu_core.training._carry import Carried, CarrySettings, borne_out, own_codes
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
@@ -66,7 +66,7 @@ class _Prepared(NamedTuple):
 
 def train_dynamics(
     garment: str | GarmentTemplate,
-    datasets: Sequence[str | Path | GarmentDataset | GarmentSequences],
+    datasets: data.Sets,
     folder: str | Path,
     *,
     mode: str = "hybrid",
@@ -88,12 +88,11 @@ def train_dynamics(
         mode: mode of the tailornet; modes that share one share the dynamics, too.
         like: a related garment whose dynamics ship: what they know is carried over first, and learning goes on there.
     """
-    template, folder = load_garment(garment) if isinstance(garment, str) else garment, Path(folder)
-    opened = data.TrainingSet.of(template, datasets, body)
+    opened = data.TrainingSet.of(garment, datasets, body)
+    template, body, samples, folder = opened.garment, opened.body, opened.samples, Path(folder)
     sets = [one for one in opened.sets if isinstance(one, GarmentSequences)]
     if len(sets) < len(opened.sets):
         raise RefuError(f"dynamics need sequences, got samples at rest: refu simulate {template.name} --sequences")
-    body, samples = opened.body, opened.samples
     test = opened.test()  # where no set is for the test, that is said before any work
     still, card_of_still = opened.tailornet(folder, mode)
     settings = settings or DynamicsSettings()
@@ -202,8 +201,7 @@ def _figures(
     """MPVE on the test sequences [mm]: with dynamics, without, and the least that the basis allows."""
 
     def predicted(pose: Tensor, style_shape: Tensor, owed: Tensor) -> Tensor:
-        displacement: Tensor = still.decoder(still.code(still.features(pose), style_shape) + owed)
-        return displacement
+        return still.decoder(still.code(still.features(pose), style_shape) + owed)
 
     moved = data.in_chunks(dynamics, *prepared[:3])
     owed = {"mpve_mm": moved, "still_mm": torch.zeros_like(moved), "basis_mm": prepared.code}

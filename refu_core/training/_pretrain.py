@@ -52,16 +52,11 @@ class PretrainSettings:
     validation_share: float = 0.08
 
     @classmethod
-    def paper(cls) -> PretrainSettings:
-        """TailorNet's own settings."""
-        loop = LoopSettings(batch_size=32, learning_rate=1e-4, weight_decay=1e-6, check_every=1000)
-        return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, is_joint=False)
-
-    @classmethod
     def of(cls, backbone: str, preset: str = "realtime", *, samples: int = 0) -> PretrainSettings:
         """A backbone's settings in a preset, for this many samples of a training split."""
-        if preset == "paper":
-            return cls.paper()
+        if preset == "paper":  # TailorNet's own
+            loop = LoopSettings(batch_size=32, learning_rate=1e-4, weight_decay=1e-6, check_every=1000)
+            return cls(loop, style_shape_steps=100_000, low_steps=300_000, steps=300_000, is_joint=False)
         if backbone == "tailornet" and samples >= MANY:
             return cls(LoopSettings(weight_decay=0.1), low_steps=10_000, steps=6000, dropout=0.05)
         # A gcnn's step costs many times that of a network with an output basis, and larger batches hardly help.

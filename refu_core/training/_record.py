@@ -116,7 +116,6 @@ class TrainingLog:
 
     def draw(self) -> None:
         """Draws all curves so far, one panel per stage."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         stages: dict[str, list[dict[str, Any]]] = defaultdict(list)
@@ -125,7 +124,6 @@ class TrainingLog:
         if not stages or not self._is_writer:
             return
         figure = Figure(figsize=(4.2 * len(stages), 3.2), layout="constrained")
-        FigureCanvasAgg(figure)
         panels = figure.subplots(1, len(stages), squeeze=False)[0]
         for axes, (stage, entries) in zip(panels, stages.items(), strict=True):
             for name in sorted({key for entry in entries for key in entry} - {"stage", "step"}):

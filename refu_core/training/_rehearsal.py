@@ -15,7 +15,7 @@ from torch import Tensor
 
 from refu_core.backbones import Network
 from refu_core.errors import RefuError
-from refu_core.simulation import Clip, SamplePlan, load_clips, names_of, split_clips
+from refu_core.simulation import Clip, SamplePlan, names_of, split_clips
 from refu_core.training._data import Mirror, TrainingSamples, in_chunks, mirror_pose
 
 _SEEDS_APART = 1_000_003
@@ -67,8 +67,7 @@ class Rehearsal:
         if recorded > 0:
             if self.motions is None:
                 raise RefuError(f"up to {recorded:.0%} of what is to be rehearsed are recorded poses: give them")
-            all_clips = load_clips(self.motions) if isinstance(self.motions, (str, Path)) else self.motions
-            clips = split_clips(all_clips)[0]
+            clips = split_clips(self.motions)[0]
         chosen = [*_spread(plans, self.count), *islice(_further(plans, self.further), self.further)]
         pose = torch.as_tensor(np.stack([plan.pose(slot, 0, clips)[0] for plan, slot in chosen]))
         shapes = zip(*(plan.style_shape(plan.pair_of(slot)) for plan, slot in chosen), strict=True)
@@ -107,7 +106,7 @@ def symmetric(network: Network, mirror: Mirror) -> Asked:
     return mean
 
 
-def plans_of(card: Mapping[str, Any], *, known: Sequence[Mapping[str, Any]] = ()) -> list[Mapping[str, Any]]:
+def plans_of(card: Mapping[str, Any], *, known: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """The plans that weights were trained on, by their card, except `known`: the rehearsed ones, then their sets'."""
     rehearsed, sets = card.get("rehearsed"), card.get("datasets", [card.get("dataset")])  # one set, in older cards
     earlier = rehearsed.get("plans") if isinstance(rehearsed, Mapping) else None

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _LARGEST = 1 << 20
 _LONGEST = 64
-_WRONG = (KeyError, TypeError, ValueError, AttributeError, LookupError, ArithmeticError, RuntimeError, RefuError)
+_WRONG = (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, RuntimeError, RefuError)
 """What constructors raise for sizes that no network can have."""
 
 Config = TypeVar("Config", bound="DataclassInstance")

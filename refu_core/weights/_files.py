@@ -182,7 +182,8 @@ def _whole(stored: Weights, base: Mapping[str, Tensor]) -> Weights:
         name = name.removesuffix(_STEP)
         steps, start = stored.tensors.get(name, step), base.get(name)
         is_known = is_difference == (start is not None) and (start is None or start.shape == steps.shape)
-        fits = steps.dtype == torch.int8 and step.shape in ((), (*steps.shape[:1], 1, *steps.shape[2:]))
+        rows = (*steps.shape[:1], 1, *steps.shape[2:]) if steps.dim() > 1 else ()
+        fits = steps.dtype == torch.int8 and step.shape in ((), rows)
         if not (is_known and fits):
             what = "a number of steps"
             wanted = f"a difference from a tensor of {stored.card['base']}.safetensors" if is_difference else what

@@ -192,6 +192,8 @@ def test_refuses_what_is_no_mesh() -> None:
     checker.update(torch.from_numpy(TETRAHEDRON))
     with pytest.raises(MeshError, match="got 1 of 4 with NaN"):
         checker.check(np.where(TETRAHEDRON == -1, np.nan, TETRAHEDRON), TETRAHEDRON_FACES)
+    with pytest.raises(MeshError, match=r"faces must be integers of shape \(F, 3\), got"):
+        checker.check(np.zeros((4, 3)), None)
     with pytest.raises(MeshError, match="vertices 0 to 3, got 0 to 4"):
         checker.check(TETRAHEDRON, TETRAHEDRON_FACES + 1 - (TETRAHEDRON_FACES == 0))
     with pytest.raises(MeshError, match="open edges"):

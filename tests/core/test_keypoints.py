@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from msg_adapters import iter_smpl_frames, read_motion
 from refu_core import FrameError, RefuError, SmplFrame, load_body
-from refu_core.keypoints import LAYOUTS, KeypointTracker, People, Proportions, Skeleton, keypoint_layout
+from refu_core.keypoints import LAYOUTS, MOST_PEOPLE, KeypointTracker, People, Proportions, Skeleton, keypoint_layout
 from refu_core.keypoints._pose import Pose, exp_so3, log_so3
 from refu_core.recordings._followed import SMPL_POINTS, follow
 from refu_core.skeleton import JOINT_NAMES
@@ -342,6 +342,16 @@ def test_a_person_whose_keypoints_are_refused_is_nobody() -> None:
     with pytest.raises(FrameError):
         people.update("a", np.zeros((5, 3)), confidence=None, stamp_ns=1, now_ns=1)
     assert people.at(2) == {}
+
+
+def test_refused_keypoints_take_nobodys_place() -> None:
+    people, points = People(skeleton("coco17")), points_of(SmplFrame(np.zeros((24, 3))), "coco17")
+    people.update("ann", points, confidence=None, stamp_ns=1, now_ns=1)
+    for name in map(str, range(MOST_PEOPLE)):
+        with pytest.raises(FrameError, match="millimetres"):
+            people.update(name, 1e3 * points, confidence=None, stamp_ns=1, now_ns=1)
+    people.update("bob", points, confidence=None, stamp_ns=1, now_ns=1)
+    assert {*people.at(2)} == {"ann", "bob"}
 
 
 def test_clocks() -> None:

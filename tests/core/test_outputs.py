@@ -364,6 +364,7 @@ def test_where_nobody_is_nothing_is_seen() -> None:
     assert all_visible([], camera) == []
     assert np.isinf(depth_image([], camera)).all()
     assert depth_image([], camera).shape == (camera.height, camera.width)
+    assert depth_image([], PinholeCamera.looking_at((0, 0, 0), (0, 0, 1), width=8.0, height=6.0)).shape == (6, 8)
 
 
 def test_visible_agrees_with_rays(pipeline: GarmentPipeline) -> None:
@@ -422,6 +423,7 @@ def test_what_is_seen_of_two_squares() -> None:
         (lambda: OPENINGS.frames(np.full((7662, 3), np.nan)), "must be finite, got 7662 of 7662"),
         (lambda: PinholeCamera.looking_at([0, 0, 0], [0, 1, 0]), "can't have .* in the middle and the y axis up"),
         (lambda: PinholeCamera(0, 1, (1, 1), (0, 0), np.eye(3), np.zeros(3)), "a camera has a size in pixels"),
+        (lambda: PinholeCamera(9, 9.5, (1, 1), (0, 0), np.eye(3), np.zeros(3)), "a camera has a size in pixels"),
         (lambda: PinholeCamera(9, 9, (1, 1), (0, 0), 2 * np.eye(3), np.zeros(3)), "a camera has a size in pixels"),
         (lambda: PinholeCamera(9, 9, (1, 1), (0, 0), np.diag([1, 1, -1]), np.zeros(3)), "a camera has .* a rotation"),
     ],

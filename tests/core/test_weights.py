@@ -210,6 +210,7 @@ def test_bytes_are_off_by_half_a_step_and_stay_the_same(tmp_path: Path, shape: t
         {"w": torch.ones(4, 3, dtype=torch.int8), "w.step": torch.ones(4)},
         {"w": torch.ones(4, 3, dtype=torch.int8), "w.step": torch.ones(3, 1)},
         {"w": torch.ones(4, 3, dtype=torch.int8), "w.step": torch.ones(4, 3)},
+        {"w": torch.ones(4, dtype=torch.int8), "w.step": torch.ones(4, 1)},  # together they would be 4 x 4
     ],
 )
 def test_what_is_no_number_of_steps_is_refused(tmp_path: Path, tensors: dict[str, torch.Tensor]) -> None:
