@@ -15,7 +15,7 @@ from refu_core.errors import RefuError, printable
 from refu_core.garments import GarmentTemplate
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._pretrain import code_loss
+from refu_core.training._loss import code_loss
 from refu_core.training._rehearsal import Rehearsal
 
 

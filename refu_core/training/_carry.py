@@ -26,7 +26,7 @@ from refu_core.modes import SdfMode
 from refu_core.simulation import random_pose
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
-from refu_core.training._pretrain import code_loss
+from refu_core.training._loss import code_loss
 from refu_core.weights import load_weights, save_weights, weights_folder
 
 _DOUBT = 0.1

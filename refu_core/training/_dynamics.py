@@ -29,7 +29,7 @@ from refu_core.simulation import GarmentSequences
 from refu_core.training import _data as data
 from refu_core.training._carry import Carried, CarrySettings, borne_out, own_codes
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
-from refu_core.training._pretrain import code_loss
+from refu_core.training._loss import code_loss
 
 
 @dataclass(frozen=True)

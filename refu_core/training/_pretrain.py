@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
+from refu_core.training._loss import DenseError, VertexError, code_loss, vertex_loss
 from refu_core.training._rehearsal import Rehearsal, plans_of, symmetric
 from refu_core.weights import load_weights
 
@@ -218,18 +219,22 @@ def stages(
             model.mean.copy_(mean)
             model.scale.copy_((train.displacement - mean).std())
         parts = [(s.betas, s.pose, s.style, s.displacement) for s in (train, validation)]
-        objective = Objective([model], model, _vertex_loss)
+        objective = Objective([model], model, vertex_loss)
         return [TrainingStage("all", objective, settings.steps, *parts)]
+    decoder = model.decoder
+    last = VertexError(decoder) if isinstance(decoder, nets.BasisDecoder) else DenseError()
     inputs = [(model.features(s.pose), s.style_shape) for s in (train, validation)]
-    codes = [data.in_chunks(model.decoder.encode, s.displacement, size=256) for s in (train, validation)]
-    loss = code_loss(model)
-    both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
+    whole = [(*given, last.targets(s.displacement)) for given, s in zip(inputs, (train, validation), strict=True)]
     if isinstance(model, nets.Mlp):
-        return [TrainingStage("all", Objective([model.net], model.code, loss), settings.steps, *both)]
-    joint = Objective([model.low, model.high], model.code, loss)
-    together = TrainingStage("joint", joint, settings.steps, *both, rate=settings.joint_rate)
+        return [TrainingStage("all", Objective([model.net], model.code, last), settings.steps, *whole)]
+    joint = Objective([model.low, model.high], model.code, last)
+    together = TrainingStage("joint", joint, settings.steps, *whole, rate=settings.joint_rate)
     if goes_on:
         return [together]
+
+    loss = code_loss(model)
+    codes = [data.in_chunks(decoder.encode, s.displacement, size=256) for s in (train, validation)]
+    both = [(x, s, code) for (x, s), code in zip(inputs, codes, strict=True)]
 
     smooth = nets.LaplacianSmoothing(garment)
     coarse = [low_frequency_code(model, smooth, garment, s) for s in (train, validation)]
@@ -292,23 +297,6 @@ def take_inputs(model: nets.Network, train: data.TrainingSamples, garment: Garme
             net.standardise(inputs)
         else:
             net.standardise(inputs, groups[:n], is_bounded=bounded[:n])
-
-
-def code_loss(model: nets.TailorNet | nets.Mlp | nets.Beyond) -> Callable[[Tensor, Tensor], Tensor]:
-    """What tells the distance between the garments of two codes [mm].
-
-    Dense codes are vertices: L1, as in the original. In an orthonormal basis, distances between codes give root mean
-    square distances of vertices; networks trained on these instead of on the L1 of vertices are as good in a quarter of
-    the time.
-    """
-    if not isinstance(model.decoder, nets.BasisDecoder):
-        return _vertex_loss
-    n = model.decoder.n_vertices
-    return lambda predicted, target: 1e3 * (predicted - target).norm(dim=1).mean() / n**0.5
-
-
-def _vertex_loss(predicted: Tensor, target: Tensor) -> Tensor:
-    return 1e3 * (predicted - target).abs().mean()
 
 
 def low_frequency_code(
