@@ -10,7 +10,7 @@ import numpy as np
 
 from msg_adapters.cdr import NS_PER_S, Buffer, CdrReader
 from msg_adapters.errors import DecodeError
-from msg_adapters.inputs import INPUT_TYPES, KEYPOINT_TYPES, decode_keypoints, decoder_for, frame_id_of
+from msg_adapters.inputs import KEYPOINT_TYPES, decode_keypoints, decoder_for, frame_id_of
 from refu_core.errors import FrameError
 from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL, SmplFrame
 from refu_core.keypoints import MOST_PEOPLE, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
@@ -59,7 +59,7 @@ class InputStream:
         self.is_of_keypoints = input_type in KEYPOINT_TYPES
         self._input_type = input_type
         self._decoder = None if self.is_of_keypoints else decoder_for(input_type)
-        self.message_type = (INPUT_TYPES | KEYPOINT_TYPES)[input_type]
+        self.message_type = KEYPOINT_TYPES[input_type] if self._decoder is None else self._decoder.message_type
         self._people: tuple[People, int] | None = None
         """Who is followed, and how many keypoints each has."""
         self._followed: tuple[object, ...] = ()
