@@ -69,7 +69,7 @@ class CdrReader:
     def skip(self, n_bytes: int) -> memoryview:
         """The next `n_bytes`, as a view."""
         end = self.place + n_bytes
-        if not self.place <= end <= len(self._data):
+        if end > len(self._data):
             msg = f"wanted {n_bytes} more bytes at byte {self.place}, the message has {max(self.remaining, 0)}"
             raise DecodeError(msg)
         view = self._data[self.place : end]
