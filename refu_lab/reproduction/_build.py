@@ -90,14 +90,16 @@ def posture_table(study: Study) -> ResultTable:
         known = {sample.posture for sample in after.samples}
         postures = [posture for posture in POSTURES if posture in known]
         whole = Figures.over(after.of_postures(postures)).mpve_mm if postures else None
-        groups = {**{posture: [posture] for posture in postures}, "all of them": postures}
-        for title, group in groups.items() if whole else ():
+        if not whole:
+            continue
+        groups = {posture: [posture] for posture in postures} | {"all of them": postures}
+        for title, group in groups.items():
             figures = Figures.over(after.of_postures(group))
             values = {
                 "n_samples": float(figures.n_frames),
                 "network_mpve_mm": Figures.over(before.of_postures(group)).mpve_mm,
                 "mpve_mm": figures.mpve_mm,
-                "share_of_mean": None if figures.mpve_mm is None or whole is None else figures.mpve_mm / whole,
+                "share_of_mean": None if figures.mpve_mm is None else figures.mpve_mm / whole,
                 "cfmp_percent": figures.cfmp_percent,
             }
             table.add(garment, title, values)
