@@ -21,7 +21,8 @@ from refu_core.recordings import FASTEST, LONGEST_TURN, axis_of, upright_share
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
 
-_MAX_STAMP_NS = 2**31 * NS_PER_S
+MAX_STAMP_NS = 2**31 * NS_PER_S
+"""From here on a stamp doesn't fit a message."""
 _LOOKED_AT = 100
 """Frames of a sender that are judged together."""
 
@@ -45,7 +46,7 @@ def check_plausible(frame: SmplFrame) -> None:
 
 def check_stamp(stamp_ns: int) -> None:
     """Raises `FrameError` for a time [ns] that no message holds, or before the clock's beginning."""
-    if not 0 <= stamp_ns < _MAX_STAMP_NS:
+    if not 0 <= stamp_ns < MAX_STAMP_NS:
         raise FrameError(f"wanted a stamp that fits a ROS time, got {stamp_ns} ns")
 
 
