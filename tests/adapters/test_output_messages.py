@@ -292,6 +292,8 @@ def test_openings_that_cannot_be() -> None:
         encode_polygon(np.full((3, 3), np.nan), stamp_ns=0)
     with pytest.raises(EncodeError, match="wanted finite points"):
         encode_polygon(np.zeros(3), stamp_ns=0)
+    with pytest.raises(EncodeError, match=r"wanted numbers that float32 can hold, got magnitudes up to 1e\+39"):
+        encode_polygon(np.diag([1.0, -1e39, 1.0]), stamp_ns=0)
     bad = rim(np.eye(3))
     bad.ring[0] = np.inf
     with pytest.raises(EncodeError, match="neck: wanted finite points"):
