@@ -58,7 +58,7 @@ class Case(NamedTuple):
         return bool(off and np.allclose(place.turn, self.turn, atol=0.2)) and abs(abs(arms) - (self.arms or 0)) < 0.175
 
 
-def cases(n: int, seed: int = 0) -> Iterator[Case]:
+def cases(n: int, seed: int) -> Iterator[Case]:
     """Meshes drawn at random."""
     rng = np.random.default_rng(seed)
     for k in range(n):

@@ -69,7 +69,7 @@ class CdrReader:
     def skip(self, n_bytes: int) -> memoryview:
         """The next `n_bytes`, as a view."""
         end = self.place + n_bytes
-        if not self.place <= end <= len(self._data):
+        if end > len(self._data):
             msg = f"wanted {n_bytes} more bytes at byte {self.place}, the message has {max(self.remaining, 0)}"
             raise DecodeError(msg)
         view = self._data[self.place : end]
@@ -189,9 +189,17 @@ class CdrWriter:
         self.fields("I" + "s" * len(texts), len(texts), *texts)
 
     def array(self, kind: str, values: Any) -> int:
-        """Append an array's numbers as a numpy kind ("f4", "f8"), without a length; returns their payload offset."""
+        """Append an array's numbers as a numpy kind ("f4", "f8"), without a length; returns their payload offset.
+
+        Raises `EncodeError` for doubles that float32 can't hold.
+        """
         dtype = np.dtype(f"<{kind}")
-        array = np.ascontiguousarray(values, dtype=dtype)
+        try:
+            with np.errstate(over="raise"):
+                array = np.ascontiguousarray(values, dtype=dtype)
+        except FloatingPointError:
+            largest = np.abs(values).max()
+            raise EncodeError(f"wanted numbers that {dtype.name} can hold, got magnitudes up to {largest:g}") from None
         if array.size:
             self.align(dtype.itemsize)
         start = len(self._payload)

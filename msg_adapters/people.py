@@ -10,7 +10,7 @@ import numpy as np
 
 from msg_adapters.cdr import NS_PER_S, Buffer, CdrReader
 from msg_adapters.errors import DecodeError
-from msg_adapters.inputs import INPUT_TYPES, KEYPOINT_TYPES, decode_keypoints, decoder_for, frame_id_of
+from msg_adapters.inputs import KEYPOINT_TYPES, decode_keypoints, decoder_for, frame_id_of
 from refu_core.errors import FrameError
 from refu_core.frames import PLAUSIBLE_ANGLE, PLAUSIBLE_COEFFICIENT, PLAUSIBLE_TRANSL, SmplFrame
 from refu_core.keypoints import MOST_PEOPLE, People, Proportions, Skeleton, TrackerSettings, keypoint_layout
@@ -21,7 +21,8 @@ from refu_core.recordings import FASTEST, LONGEST_TURN, axis_of, upright_share
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
 
-_MAX_STAMP_NS = 2**31 * NS_PER_S
+MAX_STAMP_NS = 2**31 * NS_PER_S
+"""From here on a stamp doesn't fit a message."""
 _LOOKED_AT = 100
 """Frames of a sender that are judged together."""
 
@@ -45,7 +46,7 @@ def check_plausible(frame: SmplFrame) -> None:
 
 def check_stamp(stamp_ns: int) -> None:
     """Raises `FrameError` for a time [ns] that no message holds, or before the clock's beginning."""
-    if not 0 <= stamp_ns < _MAX_STAMP_NS:
+    if not 0 <= stamp_ns < MAX_STAMP_NS:
         raise FrameError(f"wanted a stamp that fits a ROS time, got {stamp_ns} ns")
 
 
@@ -59,7 +60,7 @@ class InputStream:
         self.is_of_keypoints = input_type in KEYPOINT_TYPES
         self._input_type = input_type
         self._decoder = None if self.is_of_keypoints else decoder_for(input_type)
-        self.message_type = (INPUT_TYPES | KEYPOINT_TYPES)[input_type]
+        self.message_type = KEYPOINT_TYPES[input_type] if self._decoder is None else self._decoder.message_type
         self._people: tuple[People, int] | None = None
         """Who is followed, and how many keypoints each has."""
         self._followed: tuple[object, ...] = ()

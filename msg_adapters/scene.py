@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -43,9 +43,9 @@ class Arrival:
     frame: SmplFrame
     received: float
     """On the scene's clock [s]."""
-    placement: Placement = field(default_factory=Placement)
+    placement: Placement
     """From the sender's frame to that of the messages."""
-    camera: PinholeCamera | None = None
+    camera: PinholeCamera | None
     """The camera that sees the person, in the frame of the messages."""
 
 

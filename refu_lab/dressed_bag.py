@@ -9,6 +9,7 @@ import msg_adapters as adapters
 from msg_adapters import FrameRecord
 from msg_adapters.diagnostics import ERROR, OK, WARN
 from msg_adapters.markers import SKIN
+from msg_adapters.people import MAX_STAMP_NS
 from refu_core import GarmentPipeline, SmplFrame
 from refu_core.realtime import PipelineOutput
 from refu_lab.commands.replay import ReplayOptions
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from refu_lab.replay import GarmentRecord
 
 GARMENTS_TOPIC, BODY_TOPIC, DIAGNOSTICS_TOPIC = "/garments", "/body", "/diagnostics"
-_LAST_STAMP_NS = 2**31 * 10**9 - 1
-"""The latest stamp that a message can hold."""
 
 
 def garment_meshes(pipeline: GarmentPipeline, person: str = "") -> list[adapters.MarkerMesh]:
@@ -80,7 +79,7 @@ class DressedBag:
         """Writes a message as it came, and why it was not replayed."""
         self._skipped += 1
         self._add_input(record)
-        stamp_ns = min(record.stamp_ns, _LAST_STAMP_NS)  # the stamp may be the reason
+        stamp_ns = min(record.stamp_ns, MAX_STAMP_NS - 1)  # the stamp may be the reason
         self._say(record, stamp_ns, [self._input(ERROR, reason)])
 
     @undisturbed()

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import count, islice
+from itertools import chain, count, islice
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -200,12 +200,16 @@ def _obj(meshes: Sequence[ExportMesh], frame: int) -> bytes:
 
 def usd_names(names: Sequence[str]) -> list[str]:
     """Names as USD requires them, of ASCII letters, digits and underscores; those that become alike are numbered."""
+    plain = ("".join(c if c.isascii() and c.isalnum() else "_" for c in given) for given in names)
+    return numbered(("_" * (not one or one[0].isdigit()) + one for one in plain), mark="_")
+
+
+def numbered(names: Iterable[str], *, mark: str) -> list[str]:
+    """The names, each once: those that occur again end in `mark` and a number."""
     found: list[str] = []
-    for given in names:
-        plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in given)
-        plain = "_" * (not plain or plain[0].isdigit()) + plain
-        numbered = (f"{plain}_{k}" for k in count(2))
-        found.append(plain if plain not in found else next(name for name in numbered if name not in found))
+    for name in names:
+        others = (f"{name}{mark}{k}" for k in count(2))
+        found.append(next(one for one in chain([name], others) if one not in found))
     return found
 
 

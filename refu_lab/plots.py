@@ -18,11 +18,9 @@ def new_axes(
     rows: int = 1, columns: int = 1, *, size: tuple[float, float], **options: Any
 ) -> tuple[Figure, list[Axes]]:
     """A figure of the given size [inches] and its axes, row by row; `options` are those of `Figure.subplots`."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
     axes: list[Axes] = list(np.ravel(figure.subplots(rows, columns, **options)))
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)

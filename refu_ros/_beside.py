@@ -46,7 +46,7 @@ _MOST_WAITING = 8
 """Requests that may wait: anyone who asks faster than frames can be dressed is told so."""
 _MOST_PIPELINES = 2
 NICE = 10
-"""Niceness of work on request: garments that are due 30 times a second come first."""
+"""Niceness of work on request above the node's: garments that are due 30 times a second come first."""
 
 
 def load(options: PipelineOptions, *, threads: int = 1) -> Fittings:
@@ -109,7 +109,7 @@ class RequestDresser:
         if not self._waiting.acquire(blocking=False):
             raise RefuError(f"{_MOST_WAITING} requests wait already: ask again when one has been answered")
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, "dresser", initializer=_give_way)
+            self._pool = ThreadPoolExecutor(1, "dresser", initializer=_begin_thread)
         asked = self._pool.submit(self._dress, self._pool, frame, settings, then)
         asked.add_done_callback(lambda _: self._waiting.release())
         return asked
@@ -135,11 +135,15 @@ class RequestDresser:
         return then(output, placed)
 
 
-def _give_way() -> None:
+def _begin_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)  # to Linux a thread is a process
+    _give_way(threading.get_native_id())  # to Linux a thread is a process
+
+
+def _give_way(process: int) -> None:
+    os.setpriority(os.PRIO_PROCESS, process, os.getpriority(os.PRIO_PROCESS, process) + NICE)
 
 
 def asked_frame(request: Any) -> SmplFrame:
@@ -199,7 +203,7 @@ class BagJob:
         pipes: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         try:
             self._process = subprocess.Popen(command, **pipes, start_new_session=True)
-            os.setpriority(os.PRIO_PROCESS, self._process.pid, NICE)
+            _give_way(self._process.pid)
         except ProcessLookupError:  # it has ended already: `_wait` says why
             pass
         except OSError as error:

@@ -114,8 +114,8 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
         (recent["late_transform"], WARN, late),
         (now.doubted, WARN, now.doubted),
         (now.has_foreign_betas, WARN, FOREIGN_BETAS),
+        (True, OK, f"{report.rate('received'):.1f} Hz"),
     ]
-    rules += [(True, OK, f"{report.rate('received'):.1f} Hz")]
     way = "shown as" if now.is_untransformed else "transformed to"
     values = {
         "subscribed": "no" if now.listening_for is None else "yes",

@@ -165,8 +165,8 @@ def _fill(result: Any, done: dict[str, Any], output: object) -> None:
     result.output, result.frames = str(output), done["frames"]
     for name, figures in done["garments"].items():
         result.garments.append(name)
-        for shares, name in ((result.vfcp_percent, "vfcp_percent"), (result.cfmp_percent, "cfmp_percent")):
-            shares.append(math.nan if figures[name] is None else figures[name])  # cancelled before its first frame
+        for metric in ("vfcp_percent", "cfmp_percent"):  # None: cancelled before its first frame
+            getattr(result, metric).append(math.nan if figures[metric] is None else figures[metric])
     result.success = not done["interrupted"]
     said = ["cancelled: the bag has the frames that were done"] if done["interrupted"] else done["warnings"]
     result.message = printable("; ".join(said))

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Adds styles to the built-in garments: run after `build_garments.py`, which writes them without.
 
-    python scripts/build_styles.py [--assets refu_core/assets] [--output DIR] [GARMENT ...]
+    python scripts/build_styles.py [--output DIR] [GARMENT ...]
 
 Replaces a garment's `v_template` by the mean cut and adds `styledirs` and `tailoring_from_style`; about a
 minute a garment. See docs/guide/data.md, "Styles".

@@ -23,7 +23,7 @@ from asset_tools.remesh import remesh
 from asset_tools.surfaces import Faces, Vertices, boundary_loops, self_intersections
 from build_garments import Field, area, cut_out, drape, edge_for, keep_clear, ramp
 
-from refu_core.body import BUILTIN_BODIES, SmplBody, load_body
+from refu_core.body import SmplBody, load_body
 from refu_core.fitting import GarmentDetails, Placing, PosedBody, SurfaceMesh, Transfer, fit_garment
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import save_garment
@@ -181,7 +181,6 @@ def main() -> None:
     for name in arguments.garments:
         start = time.perf_counter()
         body = load_body(name.rpartition("-")[2])
-        assert body.name in BUILTIN_BODIES
         pattern_of, color = WARDROBE[name]
         pattern = pattern_of(Measures.of(body), color)
         v, f = build(pattern, body)

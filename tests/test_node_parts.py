@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -1154,3 +1154,20 @@ def test_who_asks_too_often_is_told_so() -> None:
         dresser.close()
     wanted = GarmentPipeline.load(["short-pant-male"], backbone="skinned")(frame)["short-pant-male"].local
     np.testing.assert_array_equal(seen, wanted[:, [2, 0, 1]])
+
+
+def test_work_on_request_gives_way_to_a_node_that_gives_way_itself() -> None:
+    """Its niceness was 10 whatever the node's was; from a larger one only root may go back to that."""
+    settings = NodeSettings(garments=("short-pant-male",), backbone="skinned", sdf="none")
+
+    def ask() -> int:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
+        dresser = RequestDresser()
+        try:
+            own = dresser.ask(SmplFrame(np.zeros((24, 3))), settings, lambda *_: os.getpriority(os.PRIO_PROCESS, 0))
+            return cast("int", own.result(60))
+        finally:
+            dresser.close()
+
+    with ThreadPoolExecutor(1) as node:
+        assert node.submit(ask).result() == 15

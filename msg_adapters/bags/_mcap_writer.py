@@ -57,10 +57,6 @@ class _Chunk:
     index: dict[int, list[bytes]] = field(default_factory=dict)
     """Log time and place of the messages of each channel."""
 
-    def add(self, *parts: bytes) -> None:
-        self.parts += parts
-        self.size += sum(map(len, parts))
-
 
 class McapWriter:
     """Writes one MCAP file to a newly opened stream. Errors are the stream's own."""
@@ -160,7 +156,8 @@ class McapWriter:
             self._thread.shutdown(wait=True)
 
     def _add(self, *parts: bytes) -> None:
-        self._chunk.add(*parts)
+        self._chunk.parts += parts
+        self._chunk.size += sum(map(len, parts))
         if self._chunk.size > self._chunk_bytes:
             self._end_chunk()
 

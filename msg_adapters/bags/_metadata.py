@@ -89,7 +89,7 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-def _load(text: str | bytes) -> Any:
+def _load(content: bytes) -> Any:
     """The value of a YAML document as rosbag2 writes it: each scalar is text, an integer, a Boolean or null.
 
     It is built from the parser's events, to leave out whatever takes more than linear time or makes anything but plain
@@ -97,7 +97,7 @@ def _load(text: str | bytes) -> Any:
 
     Raises one of `_UNREADABLE`.
     """
-    text = str(text, "utf-8") if isinstance(text, bytes) else text
+    text = str(content, "utf-8")
     nodes: list[list[Any]] = [[]]
     """The items of all open collections; a mapping's are its keys and values in turn."""
     is_odd = _DIRECTIVE.search(text) is not None
@@ -173,9 +173,9 @@ def read_file_paths(directory: Path) -> list[Path]:
     Raises `BagError` where the metadata can't be read, or names another storage or a compression of whole files.
     """
     path = directory / METADATA_FILE
-    text = read_file(path, most=_MAX_BYTES, error=BagError, wanted="rosbag2's metadata")
+    content = read_file(path, most=_MAX_BYTES, error=BagError, wanted="rosbag2's metadata")
     try:
-        information = _load(text)[_KEY]
+        information = _load(content)[_KEY]
         storage = str(information["storage_identifier"])
         packed = [str(information.get(f"compression_{key}") or "none").lower() for key in ("mode", "format")]
         # Only file names are used: old versions list paths with the directory, and a bag is read from one directory.

@@ -316,33 +316,32 @@ class RunningRecording:
 
     def switch(self, path: str, *, on: bool) -> tuple[str, str]:
         """Starts or stops on request; returns what has been done, and the bag. Raises `BagError` where it can't."""
-        refusal, recorder = "", self._recorder
-        if not on and recorder is None:
-            refusal = "nothing is recorded"
-        elif on and recorder is not None and recorder.running:
-            refusal = f"already recording to {recorder.path}"
-        elif on and not path:
-            refusal = "no directory: set the parameter record to one, which also starts the recording"
-        if refusal:
-            raise BagError(refusal)
-        bag = self.start(path) if on else self.end()
-        return printable(f"recording to {bag}" if on else f"{bag} is being closed"), str(bag)
+        recorder = self._recorder
+        if not on:
+            if recorder is None:
+                raise BagError("nothing is recorded")
+            self.end()
+            return printable(f"{recorder.path} is being closed"), str(recorder.path)
+        if recorder is not None and recorder.running:
+            raise BagError(f"already recording to {recorder.path}")
+        if not path:
+            raise BagError("no directory: set the parameter record to one, which also starts the recording")
+        bag = self.start(path)
+        return printable(f"recording to {bag}"), str(bag)
 
-    def stop(self) -> Path | None:
-        """Ends the recording; returns the bag that is being closed, if there is one."""
+    def stop(self) -> None:
+        """Ends the recording."""
         recorder, self._recorder, self._error = self._recorder, None, ""
-        if recorder is None:
-            return None
-        recorder.stop()
-        if error := recorder.state().error:  # an error that has ended it already
-            self._error = printable(error)
-        self._closing = [*(one for one in self._closing if not one.finished), recorder]
-        return recorder.path
+        if recorder is not None:
+            recorder.stop()
+            if error := recorder.state().error:  # an error that has ended it already
+                self._error = printable(error)
+            self._closing = [*(one for one in self._closing if not one.finished), recorder]
 
-    def end(self) -> Path | None:
+    def end(self) -> None:
         """Like `stop`, on request: nobody needs to hear of an error in a recording that isn't wanted any more."""
-        bag, self._error = self.stop(), ""
-        return bag
+        self.stop()
+        self._error = ""
 
     def put(self, topic: str, message_type: str, data: bytes, qos: QosProfile) -> None:
         """Queues a message that was sent or received now."""

@@ -29,7 +29,7 @@ class Encoder(Protocol):
     """Turns a frame into a message's CDR bytes."""
 
     def __call__(self, frame: SmplFrame, *, frame_id: str = WORLD_FRAME) -> bytes:
-        """The message in CDR; raises `EncodeError` for a stamp outside the message's range."""
+        """The message in CDR; raises `EncodeError` for a stamp or numbers outside the message's range."""
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def parse_layout(definition: str) -> Layout:
     return tuple(layout)
 
 
-def bytes_decoder(definition: str | None = None) -> Callable[[Buffer], SmplFrame]:
+def bytes_decoder(definition: str | None) -> Callable[[Buffer], SmplFrame]:
     """A decoder of CDR bytes laid out as `definition` says (None: the published message)."""
     layout = parse_layout(definition or message_definition(MESSAGE_TYPE).text)
 

@@ -112,9 +112,7 @@ def accuracies(
     return found
 
 
-def start_row(
-    options: BenchmarkOptions, *, mode: str, backbone: str, unit_ms: float, first_ever: bool = False
-) -> BenchmarkRow:
+def start_row(options: BenchmarkOptions, *, mode: str, backbone: str, unit_ms: float, first_ever: bool) -> BenchmarkRow:
     """Seconds and megabytes of a process that loads two garments and dresses one person.
 
     `first_ever` makes it compile its kernels, as on a machine where nothing has run yet. `unit_ms` is the time of the

@@ -39,7 +39,7 @@ class Section:
     options: BenchmarkOptions
     result: BenchmarkResult
     progress: Callable[[], object]
-    device: str = "cpu"
+    device: str
 
     def measure(
         self, contenders: Mapping[str, Callable[[Any], object]], windows: Sequence[Sequence[Any]] = (), **how: Any

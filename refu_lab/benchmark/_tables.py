@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from refu_lab.benchmark._measure import BenchmarkResult, BenchmarkRow
+from refu_lab.benchmark._sections import MAIN_MODES
 from refu_lab.plots import new_axes
 from refu_lab.reproduction import published_modes
 from refu_lab.tables import TextTable, picture_markdown, write_json, write_page
 
 STAGES = ("decode", "body", "collider", "backbone", "sdf", "refu", "encode")
-_MODES = ("hybrid", "accurate")
 
 
 def tables(result: BenchmarkResult) -> list[TextTable]:
@@ -41,9 +41,9 @@ def stages(result: BenchmarkResult) -> TextTable:
         for row in result.rows
         if row.stage.startswith("frame.") and (row.garment, row.device) == (main, "cpu")
     }
-    rows = [(stage, *(found.get((f"frame.{stage}", mode), "-") for mode in _MODES)) for stage in STAGES]
+    rows = [(stage, *(found.get((f"frame.{stage}", mode), "-") for mode in MAIN_MODES)) for stage in STAGES]
     note = f"Of a {main}. sdf is taking over the pose, refu the distances and the pushes."
-    return TextTable("Stages of a frame", ("stage", *(f"{mode} ms" for mode in _MODES)), rows, note)
+    return TextTable("Stages of a frame", ("stage", *(f"{mode} ms" for mode in MAIN_MODES)), rows, note)
 
 
 def sdfs(result: BenchmarkResult) -> TextTable:

@@ -146,6 +146,10 @@ def _named(sources: Collection[str]) -> Iterator[Input]:
         source: path.relative_to(shared) if shared else PurePosixPath(*[part for part in path.parts if part != "/"])
         for source, path in paths.items()
     }
+    in_stores = Counter(paths.values())
+    for source, path in paths.items():
+        if in_stores[path] > 1 and is_url(source):
+            short[source] = PurePosixPath(f"{source.partition('://')[0]}:", short[source])
     bare = {s: r.with_suffix("") if r.suffix.lower() in SUFFIXES else r for s, r in short.items()}
     count = Counter(place for name in bare.values() for place in (name, *name.parents))
     for source in sources:

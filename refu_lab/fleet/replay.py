@@ -69,7 +69,7 @@ def replay_fleet(
     make no pipeline, a folder that can't be written or that another run writes to, or an engine that can't be reached.
     """
     pipeline_for(options.replay)  # options that fail for every recording are reported once, and now
-    result = FleetResult(is_kept=(options.output or options.report) is not None)
+    result = FleetResult(is_kept=options.records is not None)
     rows: dict[int, dict[str, Any]] = {}
     with ExitStack() as stack:
         for place in dict.fromkeys((options.output, options.report)):

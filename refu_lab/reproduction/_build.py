@@ -10,7 +10,7 @@ import numpy as np
 
 from refu_core.metrics import Figures
 from refu_core.simulation import POSTURES
-from refu_lab.reproduction._methods import SEQUENCE_SHAPES
+from refu_lab.reproduction._methods import RUN_TIME_SDF, SDFS, SEQUENCE_SHAPES
 from refu_lab.reproduction._runs import RATIO_EDGES, MethodRun, Study
 from refu_lab.reproduction._tables import ALL, MAIN_METRICS, Missing, ResultTable, weighted
 
@@ -90,14 +90,16 @@ def posture_table(study: Study) -> ResultTable:
         known = {sample.posture for sample in after.samples}
         postures = [posture for posture in POSTURES if posture in known]
         whole = Figures.over(after.of_postures(postures)).mpve_mm if postures else None
-        groups = {**{posture: [posture] for posture in postures}, "all of them": postures}
-        for title, group in groups.items() if whole else ():
+        if not whole:
+            continue
+        groups = {posture: [posture] for posture in postures} | {"all of them": postures}
+        for title, group in groups.items():
             figures = Figures.over(after.of_postures(group))
             values = {
                 "n_samples": float(figures.n_frames),
                 "network_mpve_mm": Figures.over(before.of_postures(group)).mpve_mm,
                 "mpve_mm": figures.mpve_mm,
-                "share_of_mean": None if figures.mpve_mm is None or whole is None else figures.mpve_mm / whole,
+                "share_of_mean": None if figures.mpve_mm is None else figures.mpve_mm / whole,
                 "cfmp_percent": figures.cfmp_percent,
             }
             table.add(garment, title, values)
@@ -166,10 +168,8 @@ def unseen_groups(run: MethodRun) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 POSTURE_METHODS = ("tailornet", "node-hybrid")
-_SDFS = ("approx", "accurate")
-_MODES = (*_SDFS, "hybrid")
 _OPTIMISATIONS = (
-    *(f"optimisation-{sdf}{margin}" for margin in ("", "-margin") for sdf in _SDFS),
+    *(f"optimisation-{sdf}{margin}" for margin in ("", "-margin") for sdf in SDFS),
     "optimisation-on-hybrid",
     "optimisation-kept-on-hybrid",
 )
@@ -185,26 +185,26 @@ SAMPLE_TABLES: Mapping[str, SampleTable] = {
     "comparison": SampleTable(
         (
             *("skinned", "tailornet", "naive-approx", "naive-accurate", *_OPTIMISATIONS),
-            *("collision-loss-approx", "collision-loss-accurate", *(f"refu-{mode}" for mode in _MODES)),
-            *("node-skinned", *(f"node-{mode}" for mode in _MODES)),
+            *("collision-loss-approx", "collision-loss-accurate", *(f"refu-{mode}" for mode in RUN_TIME_SDF)),
+            *("node-skinned", *(f"node-{mode}" for mode in RUN_TIME_SDF)),
         )
     ),
     "ablation": SampleTable(
         (
             "tailornet",
-            *(f"fixed-bare-{sdf}" for sdf in _SDFS),
-            *(f"bare-{mode}" for mode in _MODES),
-            *(f"fixed-{sdf}{kind}" for kind in ("-bare", "-unblended", "") for sdf in _SDFS),
-            *(f"refu-{mode}{kind}" for kind in ("-bare", "-unblended", "") for mode in _MODES),
+            *(f"fixed-bare-{sdf}" for sdf in SDFS),
+            *(f"bare-{mode}" for mode in RUN_TIME_SDF),
+            *(f"fixed-{sdf}{kind}" for kind in ("-bare", "-unblended", "") for sdf in SDFS),
+            *(f"refu-{mode}{kind}" for kind in ("-bare", "-unblended", "") for mode in RUN_TIME_SDF),
         ),
         (*MAIN_METRICS, "avg_vf", "avg_ee"),
     ),
     "alpha": SampleTable(("tailornet", "alt1-approx", "alt2-approx", "refu-approx"), values=_alpha_values),
-    "gcnn": SampleTable(("gcnn", *(f"gcnn-refu-{mode}" for mode in _MODES))),
+    "gcnn": SampleTable(("gcnn", *(f"gcnn-refu-{mode}" for mode in RUN_TIME_SDF))),
     "laplacian": SampleTable(
         (
             *("tailornet", "skinned-naive", "skinned-optimisation", *_OPTIMISATIONS),
-            *(f"refu-{mode}" for mode in _MODES),
+            *(f"refu-{mode}" for mode in RUN_TIME_SDF),
             "node-hybrid",
         ),
         ("laplacian_mm", "mpve_mm"),
@@ -216,7 +216,7 @@ SAMPLE_TABLES: Mapping[str, SampleTable] = {
         is_summed=False,
     ),
     "energy": SampleTable(
-        ("skinned", "tailornet", *(f"refu-{mode}" for mode in _MODES)),
+        ("skinned", "tailornet", *(f"refu-{mode}" for mode in RUN_TIME_SDF)),
         metrics=("mean_energy", "median_energy", "zero_energy_percent", "low_energy_percent"),
         values=_energy_values,
         is_summed=False,

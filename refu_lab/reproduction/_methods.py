@@ -70,9 +70,9 @@ _TRAINING: Mapping[str, str] = {
 """Special options of `refu train` for the weights in each folder."""
 SEQUENCE_SHAPES = (5, 17)
 """Numbers of body shapes in the paper's two sets of sequences."""
-_SDFS: tuple[SdfName, ...] = ("approx", "accurate")
+SDFS: tuple[SdfName, ...] = ("approx", "accurate")
 _POST_PROCESSES: tuple[Handling, ...] = ("naive", "optimisation")
-_RUN_TIME_SDF: Mapping[str, SdfName] = {"approx": "approx", "accurate": "accurate", "hybrid": "approx"}
+RUN_TIME_SDF: Mapping[str, SdfName] = {"approx": "approx", "accurate": "accurate", "hybrid": "approx"}
 """Hybrid uses the accurate distance in the training loss, the approximate one in ReFU (paper, Sec. "Settings")."""
 
 
@@ -84,7 +84,7 @@ def _methods() -> Iterator[Method]:
         yield replace(accurate, name=f"skinned-{post}", label=f"skinned, {post} post-process, accurate", handling=post)
     yield replace(accurate, name="node-skinned", label="the node, skinned, accurate", mode="accurate", handling="node")
     yield Method("tailornet", "backbone alone (TailorNet)")
-    for sdf in _SDFS:
+    for sdf in SDFS:
         drape = Method(f"optimisation-{sdf}", f"optimisation post-process, {sdf}", handling="optimisation", sdf=sdf)
         yield drape
         yield _variant(drape, "-margin", ", with ReFU's margin", margin=DEFAULT_MARGIN)
@@ -97,12 +97,12 @@ def _methods() -> Iterator[Method]:
                 yield replace(on_hybrid, name=f"optimisation{kept}-on-hybrid", label=drape.label + label)
     gcnn = Method("gcnn", "GCNN", backbone="gcnn", base="gcnn")
     yield gcnn
-    for mode, sdf in _RUN_TIME_SDF.items():
+    for mode, sdf in RUN_TIME_SDF.items():
         refu = Method(f"refu-{mode}", f"ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
         yield from _ablated(refu, f"bare-{mode}", "bare")
         yield replace(refu, name=f"node-{mode}", label=f"the node, {mode}", handling="node")
         yield _variant(gcnn, f"-refu-{mode}", f" with ReFU, {mode}", mode=mode, handling="refu", sdf=sdf)
-    for sdf in _SDFS:
+    for sdf in SDFS:
         fixed = Method(f"fixed-{sdf}", f"fixed scale, {sdf}", mode=sdf, folder="fixed", handling="refu", sdf=sdf)
         yield from _ablated(fixed, f"fixed-bare-{sdf}", "fixed-bare")
     approx: dict[str, Any] = {"mode": "approx", "handling": "refu", "sdf": "approx"}

@@ -207,8 +207,7 @@ class OutfitJudge:
         way: NDArray[np.floating],
         way_of_skinned: NDArray[np.floating],
     ) -> Judged:
-        local, faces = out[garment].local, self._sheets[garment].faces
-        sheet = self._sheets[garment]
+        local, faces, sheet = out[garment].local, out[garment].faces, self._sheets[garment]
         sheet.update(local)
         others = [out[name] for name in out if name != garment]
         stretch = self._edge_lengths(garment, local) / self._lengths(garment, frame.betas.tobytes())

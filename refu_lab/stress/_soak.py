@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import resource
 import time
@@ -86,8 +85,8 @@ def soak(
     """Runs the same motions over and over, until `frames` or `seconds` are reached, and measures each tenth of the run.
 
     Each of the `persons` in a call has their own motion and counts as a frame; `tick` is called with the number of
-    frames after each call. After an interrupt (Ctrl-C) the tenths are those of the run so far. Raises `StressError`:
-    `frames` give fewer than ten calls, which have no tenths.
+    frames after each call. After an interrupt (Ctrl-C) the tenths are those of the run so far; it is raised where fewer
+    than ten calls have been made, which have none. Raises `StressError`: `frames` give fewer than ten calls.
     """
     calls = -(-frames // persons)
     if calls < _FEWEST:
@@ -98,7 +97,7 @@ def soak(
     log = np.ones((4, calls), np.float32)  # ones, so that its memory is touched now and doesn't look like growth
     yardstick, nan, n = Yardstick(), 0, 0
     start = time.perf_counter()
-    with contextlib.suppress(KeyboardInterrupt):
+    try:
         while n < calls and (n < _FEWEST or time.perf_counter() - start < seconds):
             cpu, wall = time.thread_time(), time.perf_counter()
             outs = pipeline(steps[n % len(steps)])
@@ -108,6 +107,9 @@ def soak(
             log[:, n] = resident_mb(), cpu, wall, same
             n += 1
             tick(persons)
+    except KeyboardInterrupt:
+        if n < _FEWEST:
+            raise
     tenths = {
         name: tuple(float(np.percentile(tenth, share)) for tenth in np.array_split(row[:n], 10))
         for (name, share), row in zip(

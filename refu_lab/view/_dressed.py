@@ -20,6 +20,7 @@ from refu_core.history import PoseHistory
 from refu_core.realtime import PipelineOutput
 from refu_core.recordings import SUFFIXES, upright_turn
 from refu_lab.commands.replay import RecordingOptions
+from refu_lab.export import numbered
 from refu_lab.render import SKIN as SKIN_COLOUR
 from refu_lab.sources import open_source
 from refu_lab.view._film import BODY, SKIN, SceneMesh
@@ -58,7 +59,7 @@ class DressedFilm:
         self._given = dict(zip(self.garments, options.garments, strict=True))
         """What each garment was asked for by: some are files."""
         self.notes: list[str] = []
-        names = _different([path.stem for path in inputs]) if len(inputs) > 1 else [""]
+        names = numbered([path.stem for path in inputs], mark="-") if len(inputs) > 1 else [""]
         self._tracks = [track for path, name in zip(inputs, names, strict=True) for track in self._read(path, name)]
         longest = max(self._tracks, key=lambda track: len(track.frames))
         self._moments = longest.times
@@ -165,11 +166,6 @@ class DressedFilm:
         if not frames:
             raise RefuError(f"{options.input}: no frame that can be shown")
         return sorted(frames, key=lambda frame: frame.stamp_ns)
-
-
-def _different(names: Sequence[str]) -> list[str]:
-    """The names, with numbers added to those that occur again."""
-    return [f"{name}-{k}" if (k := names[:i].count(name) + 1) > 1 else name for i, name in enumerate(names)]
 
 
 def _topics_of_people(path: Path) -> list[str]:

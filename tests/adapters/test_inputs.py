@@ -390,6 +390,13 @@ def test_stamps_that_no_message_can_hold(stamp_ns: int) -> None:
         encoder_for("joint_state")(replace(REST, stamp_ns=stamp_ns))
 
 
+def test_a_place_that_no_message_of_float32_can_hold() -> None:
+    far = replace(REST, transl=np.array([0.0, 1e39, 0.0]))
+    with pytest.raises(EncodeError, match="wanted numbers that float32 can hold"):
+        encoder_for("multiarray")(far)
+    assert decoder_for("pose_array").from_bytes(encoder_for("pose_array")(far)).transl[1] == 1e39
+
+
 def test_a_style_travels_in_a_multiarray() -> None:
     styled = SmplFrame(pose=np.zeros(72), style=[0.5, -1, 2, 0])
     decoded = decoder_for("multiarray").from_bytes(encoder_for("multiarray")(styled))

@@ -163,6 +163,14 @@ def standing(layout: str, place: float = 0.0) -> Any:
     return bones.posed(Pose(np.array([place, 1.0, 0.0]), exp_so3(turns), np.zeros(10))).points
 
 
+def test_a_stream_takes_the_names_that_decoders_take() -> None:
+    for name in ("multiarray", "std_msgs/Float32MultiArray", "std_msgs/msg/Float32MultiArray"):
+        assert InputStream(name).message_type == "std_msgs/msg/Float32MultiArray"
+    assert InputStream("keypoint_markers").message_type == "visualization_msgs/msg/MarkerArray"
+    with pytest.raises(DecodeError, match="wanted an input type, got 'nothing'"):
+        InputStream("nothing")
+
+
 def test_a_message_of_more_people_than_are_followed_is_refused() -> None:
     stream = InputStream("keypoint_markers")
     stream.follow(load_body("male"), "coco17")

@@ -186,6 +186,11 @@ def test_points_that_cannot_be() -> None:
             encoder.encode([np.where(np.arange(12) < 2, bad, 0.0).reshape(4, 3)], stamp_ns=0, values=clearance)
     with pytest.raises(EncodeError, match="4 of 12 are NaN or infinite"):
         encoder.encode(good, stamp_ns=0, values=clearance, offset=(0.0, 1e300, 0.0))
+    large = np.array([1e39, -1e39, 0.0, 0.0])  # for float32, in which both are infinite
+    with pytest.raises(EncodeError, match="vertices: 2 of 12 are NaN or infinite"):
+        encoder.encode([large[:, None] * (1, 0, 0)], stamp_ns=0, values=clearance)
+    with pytest.raises(EncodeError, match="clearance: 2 of 4 are NaN or infinite"):
+        encoder.encode(good, stamp_ns=0, values={"clearance": [large]})
     # A sum that overflows, of numbers that don't, is no reason to refuse them.
     huge = np.full((4, 3), 3e38, np.float32)
     message = deserialise(encoder.encode([huge], stamp_ns=0, values=clearance), POINT_CLOUD)
@@ -287,6 +292,8 @@ def test_openings_that_cannot_be() -> None:
         encode_polygon(np.full((3, 3), np.nan), stamp_ns=0)
     with pytest.raises(EncodeError, match="wanted finite points"):
         encode_polygon(np.zeros(3), stamp_ns=0)
+    with pytest.raises(EncodeError, match=r"wanted numbers that float32 can hold, got magnitudes up to 1e\+39"):
+        encode_polygon(np.diag([1.0, -1e39, 1.0]), stamp_ns=0)
     bad = rim(np.eye(3))
     bad.ring[0] = np.inf
     with pytest.raises(EncodeError, match="neck: wanted finite points"):

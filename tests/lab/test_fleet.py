@@ -158,6 +158,19 @@ def test_no_two_recordings_have_one_name(tmp_path_factory: pytest.TempPathFactor
     assert not any(one.name.startswith(f"{other.name}/") for one in found for other in found)  # its report is a folder
 
 
+def test_stores_with_the_same_paths_give_recordings_names_of_their_own(tmp_path: Path) -> None:
+    """Both were called walk.mcap: the second one's bag replaced the first one's."""
+    store = fsspec.filesystem("memory")
+    for folder in (tmp_path, tmp_path / "a"):
+        folder.mkdir(exist_ok=True)
+        (folder / "walk.mcap").touch()
+        store.pipe(f"{folder}/walk.mcap", b"x")
+    try:
+        assert names(tmp_path, f"memory://{tmp_path}") == ["walk", "a/walk", "memory:/walk", "memory:/a/walk"]
+    finally:
+        store.store.clear()
+
+
 def test_no_result_leaves_its_folder(bags: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`refu replay walk.mcap ../b --output out` wrote out/../b/walk.mcap."""
     monkeypatch.chdir(bags / "a")

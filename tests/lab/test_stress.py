@@ -270,6 +270,9 @@ def test_an_interrupted_soak_has_its_row(subject: Subject) -> None:
             raise KeyboardInterrupt
 
     assert soak(subject.pipeline, mode="here", frames=100, tick=tick).frames == 12
+    ticked[:] = [0] * 3
+    with pytest.raises(KeyboardInterrupt):  # nine calls have no tenths
+        soak(subject.pipeline, mode="here", frames=100, tick=tick)
 
 
 def test_resident_memory_is_this_process() -> None:

@@ -126,6 +126,15 @@ def test_people_of_a_bag_are_shown_together_while_they_are_there(tmp_path: Path)
     assert {shape.person for shape in film.shapes(13)} == {"anna", "ben"}  # a tenth of a second after ben's last
 
 
+def test_no_two_people_of_several_files_have_one_name(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("here/walk.mcap", "there/walk.mcap", "walk-2.mcap")]
+    for path in paths:
+        path.parent.mkdir(exist_ok=True)
+        write_bag(path, {"/smpl_params": motion(1)})
+    shapes = DressedFilm(paths, RecordingOptions(input=Path(), garments=SHORTS)).shapes(0)
+    assert [shape.person for shape in shapes if shape.name == BODY] == ["walk", "walk-2", "walk-2-2"]
+
+
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 

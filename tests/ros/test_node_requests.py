@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
@@ -287,6 +289,18 @@ def test_a_bag_is_read_in_the_axes_of_the_node(bags: Path, tmp_path: Path) -> No
             first = next(message for message in bag.messages(["/garments"]))
         garments[axes] = adapters.decode_marker_array(first.data)[0].points
     np.testing.assert_allclose(garments["smpl"], garments["frame"][:, SMPL_COLUMNS["smpl"]], atol=1e-5)
+
+
+def test_a_bag_gives_way_to_a_node_that_gives_way_itself(bags: Path, tmp_path: Path) -> None:
+    def begin() -> BagJob:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
+        settings = NodeSettings(garments=GARMENTS[:1], backbone="skinned", sdf="none")
+        return BagJob(bags / "walk.mcap", tmp_path / "out.mcap", settings, lambda *_: None)
+
+    with ThreadPoolExecutor(1) as node:
+        job = node.submit(begin).result()
+    assert os.getpriority(os.PRIO_PROCESS, job._process.pid) == 15
+    assert job.done.result()["frames"] == N_WALK
 
 
 def test_one_bag_at_a_time_and_it_can_be_cancelled(peer: Peer, bags: Path) -> None:
