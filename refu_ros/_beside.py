@@ -109,7 +109,7 @@ class RequestDresser:
         if not self._waiting.acquire(blocking=False):
             raise RefuError(f"{_MOST_WAITING} requests wait already: ask again when one has been answered")
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(1, "dresser", initializer=_begin_thread)
+            self._pool = ThreadPoolExecutor(1, "dresser", initializer=_give_way)
         asked = self._pool.submit(self._dress, self._pool, frame, settings, then)
         asked.add_done_callback(lambda _: self._waiting.release())
         return asked
@@ -135,15 +135,11 @@ class RequestDresser:
         return then(output, placed)
 
 
-def _begin_thread() -> None:
+def _give_way() -> None:
     import torch
 
     torch.set_num_threads(1)
-    _give_way(threading.get_native_id())  # to Linux a thread is a process
-
-
-def _give_way(process: int) -> None:
-    os.setpriority(os.PRIO_PROCESS, process, os.getpriority(os.PRIO_PROCESS, process) + NICE)
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), os.nice(0) + NICE)  # to Linux a thread is a process
 
 
 def asked_frame(request: Any) -> SmplFrame:
@@ -203,7 +199,7 @@ class BagJob:
         pipes: Any = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         try:
             self._process = subprocess.Popen(command, **pipes, start_new_session=True)
-            _give_way(self._process.pid)
+            os.setpriority(os.PRIO_PROCESS, self._process.pid, os.nice(0) + NICE)
         except ProcessLookupError:  # it has ended already: `_wait` says why
             pass
         except OSError as error:
