@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from refu_core._warp import as_warp, ints
 from refu_core.body import blend_transforms
-from refu_core.errors import FrameError, as_before_if_it_fails, require_type
+from refu_core.errors import FrameError, as_before_if_it_fails, require_pipeline, require_type
 from refu_core.frames import SmplFrame
 from refu_core.observation._cloth import (
     DEFAULT_OBSERVATION,
@@ -48,7 +48,7 @@ class Observer:
 
         Raises `FrameError` for no pipeline, or no settings.
         """
-        require_type(pipeline, GarmentPipeline, "a GarmentPipeline", error=FrameError)
+        require_pipeline(pipeline, "garments", "body", "adjusted", error=FrameError)
         require_type(settings, ObservationSettings, "ObservationSettings", error=FrameError)
         self._pipeline, self._settings = pipeline, settings
         self._cloths = {name: ObservedCloth(garment, settings) for name, garment in pipeline.garments.items()}

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from refu_core._warp import as_warp, ints, memory
 from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody, part_of_faces
+from refu_core.errors import MeshError, require_pipeline
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
-from refu_core.outputs._worn import require_outfit, require_pipeline, require_worn
+from refu_core.outputs._worn import require_outfit, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 PRESSED = DEFAULT_GAP + 0.003
@@ -70,7 +71,7 @@ class LimbContacts:
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> LimbContacts:
         """For the outputs of a pipeline. Raises `MeshError` for anything else."""
-        require_pipeline(pipeline)
+        require_pipeline(pipeline, "garments", "body", error=MeshError)
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:

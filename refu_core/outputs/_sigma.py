@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from refu_core.backbones import SEEN_TILT
 from refu_core.body import SmplBody
-from refu_core.errors import FrameError, MeshError, WeightsError, require_type
+from refu_core.errors import FrameError, MeshError, WeightsError, require_pipeline, require_type
 from refu_core.frames import LAGS, N_JOINTS, SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.keypoints._pose import skew
-from refu_core.outputs._worn import require_garment, require_pipeline, require_worn
+from refu_core.outputs._worn import require_garment, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.skeleton import CARRIED
 from refu_core.weights import load_weights, save_weights, weights_folder
@@ -159,7 +159,7 @@ class Sigma:
 
         Raises `WeightsError` for a damaged file of σ, and `MeshError` for no pipeline.
         """
-        require_pipeline(pipeline)
+        require_pipeline(pipeline, "garments", "body", error=MeshError)
         self._body, self._garments = pipeline.body, pipeline.garments
         self.maps: dict[str, SigmaMap] = {}
         """By garment. One that no network drapes, or whose network wasn't measured, has `UNKNOWN_SIGMA`."""
