@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from refu_core._cache import remembered
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.errors import MeshError
 
 _Float = TypeVar("_Float", np.float32, np.float64)
@@ -168,9 +169,10 @@ def as_points(
     """`values` (a tensor, too) as contiguous, finite points, shape (n, 3). Raises `MeshError` for anything else."""
     shape = f"the shape ({'N' if n is None else n}, 3)"
     try:
-        points = np.ascontiguousarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise MeshError(f"{name} must be numbers of {shape}, got {type(values).__name__}") from error
+        given = as_numbers(values.detach().cpu() if hasattr(values, "detach") else values)
+        points = np.ascontiguousarray(given, dtype=dtype)
+    except NOT_NUMBERS as error:
+        raise MeshError(f"{name} must be numbers of {shape}, got {type(values).__name__}: {error}") from error
     if points.ndim != 2 or points.shape[1] != 3 or (n is not None and len(points) != n):
         raise MeshError(f"{name} must have {shape}, got {points.shape}")
     if not np.isfinite(points).all():

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.errors import FrameError, as_before_if_it_fails, require_type
-from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
+from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame, checked_numbers
 from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3
 from refu_core.keypoints._solver import (
     BETAS,
@@ -54,7 +55,7 @@ class KeypointTracker:
     ) -> None:
         self.skeleton = skeleton
         self._settings = settings
-        self._known = None if betas is None else np.asarray(betas, np.float64)
+        self._known = None if betas is None else checked_numbers("betas", betas, (N_BETAS,), np.float64)
         self._solver = Solver(skeleton, fits_betas=betas is None, settings=settings)
         layout = skeleton.layout
         joints, other = layout.joints, layout.mirrored
@@ -142,9 +143,9 @@ class KeypointTracker:
     def _cleaned(self, points: ArrayLike, confidence: ArrayLike | None) -> _Seen:
         n = len(self.skeleton.layout)
         try:
-            given = np.asarray(points, np.float64)
-            weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
-        except (TypeError, ValueError) as error:
+            given = as_numbers(points).astype(np.float64)
+            weights = np.ones(n) if confidence is None else as_numbers(confidence, also="b").astype(np.float64)
+        except NOT_NUMBERS as error:
             raise FrameError(f"wanted {n} keypoints of {self.skeleton.layout.name} as numbers: {error}") from error
         if given.shape != (n, 3) or weights.shape != (n,):
             msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.backbones import SEEN_TILT
 from refu_core.body import SmplBody
 from refu_core.errors import FrameError, MeshError, WeightsError, require_pipeline, require_type
@@ -226,8 +227,8 @@ _LARGEST = 1e12
 
 def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
     try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor that tracks gradients
+        array = as_numbers(value).astype(np.float64)
+    except NOT_NUMBERS:
         array = np.full(0, np.nan)
     if array.shape not in shapes or not np.isfinite(array).all():
         wanted, got = " or ".join(map(str, shapes)), array.shape if array.size else type(value).__name__
