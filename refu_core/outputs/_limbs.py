@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import as_warp, ints, memory
+from refu_core._warp import Unpicklable, as_warp, ints, memory
 from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody, part_of_faces
 from refu_core.errors import MeshError, require_pipeline
 from refu_core.garments import GarmentTemplate
@@ -43,7 +43,7 @@ class LimbContact:
     """Middle of that cloth, in the axes of the garments' `local` vertices [m], shape (3,)."""
 
 
-class LimbContacts:
+class LimbContacts(Unpicklable):
     """Finds the cloth that is pressed between parts of a body, by how far the collider had to give way.
 
     This is geometry alone: it doesn't know how stiff cloth or flesh is, so it can't give a force.
