@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -24,3 +25,14 @@ def as_numbers(value: Any, *, also: str = "") -> NDArray[Any]:
         is_fine = given.dtype.kind == "f"
         return np.asarray(np.ma.filled(given if is_fine else given.astype(np.float64), np.nan))
     return np.asarray(given)
+
+
+def as_nanoseconds(value: Any) -> int:
+    """A time as Python's own whole number: NumPy's wrap around, and YAML and struct don't know them.
+
+    Raises one of `NOT_NUMBERS` for anything else, such as seconds, which have a fraction.
+    """
+    whole = int(value)
+    if isinstance(value, Real) and whole != value:  # seconds, most likely
+        raise ValueError("a fraction")
+    return whole

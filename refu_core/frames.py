@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from refu_core._numbers import NOT_NUMBERS, as_numbers
+from refu_core._numbers import NOT_NUMBERS, as_nanoseconds, as_numbers
 from refu_core.errors import FrameError
 
 N_JOINTS = 24
@@ -82,12 +81,9 @@ def _direction(name: str, value: ArrayLike) -> NDArray[np.float32]:
 def _nanoseconds(name: str, value: Any) -> int:
     """`value` as a whole number."""
     try:
-        whole = int(value)
-        if isinstance(value, Real) and whole != value:  # seconds, most likely
-            raise ValueError("a fraction")
-    except (TypeError, ValueError, OverflowError) as error:
+        return as_nanoseconds(value)
+    except NOT_NUMBERS as error:
         raise FrameError(f"{name} must be a whole number of nanoseconds, got {value!r}") from error
-    return whole
 
 
 @dataclass(frozen=True, eq=False, init=False)

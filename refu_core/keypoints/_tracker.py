@@ -99,7 +99,7 @@ class KeypointTracker:
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
         with as_before_if_it_fails(self):
-            return self._updated(seen, stamp_ns)
+            return self._updated(seen, int(stamp_ns))
 
     def _updated(self, seen: _Seen, stamp_ns: int) -> SmplFrame | None:
         dt = 1e-9 * (stamp_ns - self._stamp)
@@ -129,6 +129,7 @@ class KeypointTracker:
 
         None if nobody was seen for `hold`.
         """
+        stamp_ns = int(stamp_ns)
         if not self._is_here or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None
         coast = self._settings.coast

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import math
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 import torch
 
 import msg_adapters as adapters
-from msg_adapters import EncodeError
+from msg_adapters import BagError, EncodeError
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint_layout
 from refu_core.metrics import CollisionChecker
@@ -157,3 +159,43 @@ def test_a_tracker_refuses_betas_that_are_none(betas: Any) -> None:
 def test_points_of_a_message_are_numbers(value: Any) -> None:
     with pytest.raises(EncodeError):
         adapters.markers.finite_points("points", np.ma.stack([value] * 3, axis=1))
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint64, np.int32, float])
+def test_times_may_be_of_any_whole_type(kind: type, tmp_path: Path) -> None:
+    """A bag whose times came from NumPy lost its metadata when it was closed."""
+    data = adapters.encoder_for("multiarray")(FRAME)
+    for name, of in (("own", int), ("other", kind)):
+        with adapters.BagWriter(tmp_path / name) as writer:
+            writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+            for k in range(3):
+                writer.write("/smpl_params", data, log_time_ns=of(1000 + k))
+    own, other = (
+        [record.log_time_ns for record in adapters.iter_smpl_frames(tmp_path / name)] for name in ("own", "other")
+    )
+    assert own == other
+
+
+@pytest.mark.parametrize("value", [0.5, math.nan, "now", None])
+def test_times_that_are_none_are_refused(value: Any, tmp_path: Path) -> None:
+    """Seconds became 0 ns in a message."""
+    with pytest.raises(EncodeError, match="whole number of nanoseconds, got"):
+        adapters.cdr.split_stamp(value)
+    with adapters.BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["multiarray"])
+        with pytest.raises(BagError, match="times are nanoseconds in"):
+            writer.write("/smpl_params", b"", log_time_ns=value)
+
+
+def test_a_clock_of_unsigned_numbers_may_go_back() -> None:
+    """A hundredth of a second back was 584 years ahead, and the track began anew."""
+    tracks = [KeypointTracker(skeleton()) for _ in range(2)]
+    for stamp in (10**9, 10**9 + 33 * 10**6, 10**9 + 23 * 10**6, 10**9 + 66 * 10**6):
+        joints = _joints() + 1e-10 * (stamp - 10**9)
+        own, other = (
+            track.update(joints, stamp_ns=kind(stamp)) for track, kind in zip(tracks, (int, np.uint64), strict=True)
+        )
+        assert own is not None
+        assert other is not None
+        np.testing.assert_array_equal(own.pose, other.pose)
+        np.testing.assert_array_equal(own.transl, other.transl)
