@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.errors import DecodeError, EncodeError
-from refu_core._numbers import NOT_NUMBERS, as_nanoseconds
+from refu_core._numbers import NOT_NUMBERS, as_whole
 
 Buffer = bytes | bytearray | memoryview
 
@@ -215,7 +215,7 @@ def split_stamp(stamp_ns: int) -> tuple[int, int]:
     Raises `EncodeError` for anything but a whole number, and when the seconds don't fit the message's 32 bits.
     """
     try:
-        seconds, nanoseconds = divmod(as_nanoseconds(stamp_ns), NS_PER_S)
+        seconds, nanoseconds = divmod(as_whole(stamp_ns), NS_PER_S)
     except NOT_NUMBERS as error:
         raise EncodeError(f"a stamp is a whole number of nanoseconds, got {stamp_ns!r}") from error
     if not -(2**31) <= seconds < 2**31:

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.axes import SMPL_COLUMNS, WORLD_FRAME, InputAxes
 from msg_adapters.cdr import HEADER_BYTES, Buffer, CdrReader, CdrWriter, split_stamp
 from msg_adapters.errors import DecodeError, EncodeError
-from refu_core._numbers import NOT_NUMBERS, as_numbers
+from refu_core._numbers import NOT_NUMBERS, as_numbers, as_whole
 
 Rgba = tuple[float, float, float, float]
 CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
@@ -79,7 +79,13 @@ class MarkerMesh:
     """Red, green, blue, alpha in [0, 1]."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "faces", triangles(self.ns, self.faces, self.n_vertices))
+        if not isinstance(self.ns, str):
+            raise EncodeError(f"wanted a marker's namespace, got {type(self.ns).__name__}")
+        try:
+            n_vertices = as_whole(self.n_vertices)
+        except NOT_NUMBERS as error:
+            raise EncodeError(f"{self.ns}: wanted a number of vertices, got {self.n_vertices!r}") from error
+        vars(self).update(n_vertices=n_vertices, faces=triangles(self.ns, self.faces, n_vertices))
         color = numbers(f"{self.ns}: colour", self.color)
         if color.shape != (4,) or not ((color >= 0) & (color <= 1)).all():
             msg = f"{self.ns}: wanted a colour of 4 numbers in [0, 1] (red, green, blue, alpha), got {self.color}"

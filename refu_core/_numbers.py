@@ -27,11 +27,13 @@ def as_numbers(value: Any, *, also: str = "") -> NDArray[Any]:
     return np.asarray(given)
 
 
-def as_nanoseconds(value: Any) -> int:
-    """A time as Python's own whole number: NumPy's wrap around, and YAML and struct don't know them.
+def as_whole(value: Any) -> int:
+    """A count, or a time [ns], as Python's own whole number: NumPy's wrap around, and YAML and struct don't know them.
 
     Raises one of `NOT_NUMBERS` for anything else, such as seconds, which have a fraction.
     """
+    if isinstance(value, (str, bytes, bytearray)):
+        raise TypeError("text")
     whole = int(value)
     if isinstance(value, Real) and whole != value:  # seconds, most likely
         raise ValueError("a fraction")

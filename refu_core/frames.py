@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from refu_core._numbers import NOT_NUMBERS, as_nanoseconds, as_numbers
+from refu_core._numbers import NOT_NUMBERS, as_numbers, as_whole
 from refu_core.errors import FrameError
 
 N_JOINTS = 24
@@ -81,7 +81,7 @@ def _direction(name: str, value: ArrayLike) -> NDArray[np.float32]:
 def _nanoseconds(name: str, value: Any) -> int:
     """`value` as a whole number."""
     try:
-        return as_nanoseconds(value)
+        return as_whole(value)
     except NOT_NUMBERS as error:
         raise FrameError(f"{name} must be a whole number of nanoseconds, got {value!r}") from error
 

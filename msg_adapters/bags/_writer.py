@@ -13,7 +13,7 @@ from msg_adapters.bags import _metadata
 from msg_adapters.bags._mcap_writer import McapWriter
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
-from refu_core._numbers import NOT_NUMBERS, as_nanoseconds
+from refu_core._numbers import NOT_NUMBERS, as_whole
 
 LIBRARY = "refu-ros"
 """The writer's name in a bag, within its first 64 bytes."""
@@ -124,7 +124,7 @@ class BagWriter:
         if topic not in self._topics:
             raise BagError(f"{self.path}: {topic} isn't declared; call add_topic first")
         try:
-            time_ns = as_nanoseconds(log_time_ns)
+            time_ns = as_whole(log_time_ns)
         except NOT_NUMBERS:
             time_ns = -1
         if not 0 <= time_ns <= _metadata.MAX_TIME_NS:

@@ -77,8 +77,8 @@ class Resolver(Unpicklable):
         """
         self._settings = settings
         self.device = faces.device if isinstance(faces, Tensor) else torch.device("cpu")
-        self._n_vertices = n = n_vertices
-        mesh = Connectivity.of(faces, n)
+        mesh = Connectivity.of(faces, n_vertices)
+        self._n_vertices = n = mesh.n_vertices
         self._n_edges = e = len(mesh.edges)
         self._cloth = _cloth(mesh, self.device)
         self._faces, self._glimpsed = ints(mesh.faces, self.device), None

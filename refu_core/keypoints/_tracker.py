@@ -53,6 +53,7 @@ class KeypointTracker:
     def __init__(
         self, skeleton: Skeleton, *, betas: ArrayLike | None = None, settings: TrackerSettings = DEFAULTS
     ) -> None:
+        require_type(skeleton, Skeleton, "a Skeleton", error=FrameError)
         self.skeleton = skeleton
         self._settings = settings
         self._known = None if betas is None else checked_numbers("betas", betas, (N_BETAS,), np.float64)
@@ -127,8 +128,9 @@ class KeypointTracker:
     def at(self, stamp_ns: int) -> SmplFrame | None:
         """The pose at another time, before the next keypoints: rates continue, and die away.
 
-        None if nobody was seen for `hold`.
+        None if nobody was seen for `hold`. Raises `FrameError` for a time that isn't one.
         """
+        require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         stamp_ns = int(stamp_ns)
         if not self._is_here or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None

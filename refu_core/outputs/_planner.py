@@ -182,7 +182,7 @@ class PlannerMesh:
         """
         require_garment(garment)
         numbers: tuple[object, ...] = max_triangles, half_thickness
-        are_numbers = all(isinstance(number, Real) for number in numbers)
+        are_numbers = all(isinstance(number, Real) and math.isfinite(number) for number in numbers)
         if not are_numbers or max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
             wanted = f"{_LEAST_TRIANGLES} triangles or more and a positive half thickness"
             raise MeshError(f"wanted {wanted}, got {max_triangles} and {half_thickness}")

@@ -181,8 +181,8 @@ class Sigma:
         A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as stated and the person
         hardly moves; σ is never NaN. Moving cloth is harder to predict: σ grows by its own size for each radian that
         joints have turned (`turned_of`), if the frame knows its past.
-        Raises `FrameError` for a covariance of another shape, not finite, too large, or with a negative variance, and
-        `MeshError` for anything but an output, and for an output with other garments.
+        Raises `FrameError` for anything but a frame, and for a covariance of another shape, not finite, too large, or
+        with a negative variance; `MeshError` for anything but an output, and for an output with other garments.
 
         Args:
             frame: the one that was dressed.
@@ -191,6 +191,7 @@ class Sigma:
                 independent; it is pushed through the kinematics.
             transl_covariance: of the translation [m²], shape (3, 3).
         """
+        require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
         require_worn(output, self._garments)
         pose = None
         if pose_covariance is not None:

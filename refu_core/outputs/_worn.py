@@ -25,8 +25,8 @@ def require_garment(garment: object) -> None:
 
 def require_worn(output: object, known: Collection[str]) -> None:
     """Raises `MeshError` for anything but a pipeline's output, and for a garment that isn't `known`."""
-    require_type(output, Mapping, "a pipeline's output of one person", error=MeshError)
-    assert isinstance(output, Mapping)
+    if not (isinstance(output, Mapping) and hasattr(output, "body")):
+        raise MeshError(f"wanted a pipeline's output of one person, got {type(output).__name__}")
     for name in output:
         require_known(name, known)
 
