@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.errors import DecodeError, EncodeError
+from refu_core._numbers import NOT_NUMBERS, as_whole
 
 Buffer = bytes | bytearray | memoryview
 
@@ -219,9 +220,12 @@ class CdrWriter:
 def split_stamp(stamp_ns: int) -> tuple[int, int]:
     """Seconds and nanoseconds of a ROS time.
 
-    Raises `EncodeError` when the seconds don't fit the message's 32 bits.
+    Raises `EncodeError` for anything but a whole number, and when the seconds don't fit the message's 32 bits.
     """
-    seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
+    try:
+        seconds, nanoseconds = divmod(as_whole(stamp_ns), NS_PER_S)
+    except NOT_NUMBERS as error:
+        raise EncodeError(f"a stamp is a whole number of nanoseconds, got {stamp_ns!r}") from error
     if not -(2**31) <= seconds < 2**31:
         msg = f"a ROS time holds 32 bits of seconds, got {stamp_ns} ns; give nanoseconds since the sender's epoch"
         raise EncodeError(msg)

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.axes import SMPL_COLUMNS, WORLD_FRAME, InputAxes
 from msg_adapters.cdr import HEADER_BYTES, Buffer, CdrReader, CdrWriter, split_stamp
 from msg_adapters.errors import DecodeError, EncodeError
+from refu_core._numbers import NOT_NUMBERS, as_numbers, as_whole
 
 Rgba = tuple[float, float, float, float]
 CLOTH: Rgba = (0.55, 0.63, 0.75, 1.0)
@@ -29,8 +30,8 @@ SKIN: Rgba = (0.80, 0.67, 0.58, 1.0)
 def numbers(what: str, values: Any) -> NDArray[Any]:
     """Real numbers as an array; raises `EncodeError` for anything else."""
     try:
-        array = np.asarray(values)
-    except (ValueError, TypeError, OverflowError) as error:
+        array = as_numbers(values)
+    except NOT_NUMBERS as error:
         raise EncodeError(f"{what}: wanted an array of numbers, got {type(values).__name__}: {error}") from None
     if array.dtype.kind not in "iuf":
         raise EncodeError(f"{what}: wanted an array of numbers, got {array.dtype} of shape {array.shape}")
@@ -78,7 +79,13 @@ class MarkerMesh:
     """Red, green, blue, alpha in [0, 1]."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "faces", triangles(self.ns, self.faces, self.n_vertices))
+        if not isinstance(self.ns, str):
+            raise EncodeError(f"wanted a marker's namespace, got {type(self.ns).__name__}")
+        try:
+            n_vertices = as_whole(self.n_vertices)
+        except NOT_NUMBERS as error:
+            raise EncodeError(f"{self.ns}: wanted a number of vertices, got {self.n_vertices!r}") from error
+        vars(self).update(n_vertices=n_vertices, faces=triangles(self.ns, self.faces, n_vertices))
         color = numbers(f"{self.ns}: colour", self.color)
         if color.shape != (4,) or not ((color >= 0) & (color <= 1)).all():
             msg = f"{self.ns}: wanted a colour of 4 numbers in [0, 1] (red, green, blue, alpha), got {self.color}"

@@ -118,18 +118,31 @@ class Track:
 
     def __init__(self) -> None:
         self._rows = array("d")  # only a few numbers per frame: recordings are long
+        self._last_ns: tuple[int, int] | None = None
+        """The last frame's stamp and time of receipt, where that is known."""
+        self._n_leaps, self._leap_s = 0, 0.0
+        """How often times of receipt leapt though stamps didn't, and how far the first time [s]."""
 
     def __len__(self) -> int:
         return len(self._rows) // _NUMBERS
 
-    def add(self, frame: SmplFrame) -> None:
+    def add(self, frame: SmplFrame, *, received_ns: int | None = None) -> None:
+        """Takes in the next frame, and when it was received, where a recording says it."""
+        if received_ns is not None:
+            stamp_ns, before_ns = (frame.stamp_ns, received_ns) if self._last_ns is None else self._last_ns
+            waited_s, passed_s = 1e-9 * (received_ns - before_ns), 1e-9 * (frame.stamp_ns - stamp_ns)
+            if waited_s < min(passed_s, 0.0) - _LEAST_LEAP_S or waited_s > max(passed_s, 0.0) + _LONGEST_S:
+                self._n_leaps += 1
+                self._leap_s = self._leap_s or waited_s
+            self._last_ns = frame.stamp_ns, received_ns
         longest = float(np.linalg.norm(frame.pose, axis=1).max())
         self._rows.extend((longest, 1e-9 * frame.stamp_ns, *frame.pose[0], *frame.transl))
 
     def doubts(self, *, is_y_up: bool) -> dict[str, str]:
-        """What is doubtful in most frames: a sentence for each of `angles`, `pace`, `stamps` and `axes` that is.
+        """What is doubtful in most frames: a sentence for each that is.
 
-        `is_y_up`: the frames are said to be in SMPL's axes.
+        Of `angles`, `pace`, `stamps`, `receipt` (leaps in any frame) and `axes`. `is_y_up`: the frames are said to be
+        in SMPL's axes.
         """
         rows = np.frombuffer(self._rows).reshape(-1, _NUMBERS)
         if not len(rows):
@@ -146,6 +159,9 @@ class Track:
             found["stamps"] = f"stamps don't advance in {n_still} of {len(rows)} frames: does the sender's clock run?"
         elif len(steps) and not _SHORTEST_S <= (step := float(np.median(steps))) <= _LONGEST_S:
             found["stamps"] = f"frames are {step:.2g} s apart by their stamps: are those in another unit?"
+        if self._n_leaps:
+            times = f"times of receipt leap in {self._n_leaps} of {len(rows)} frames, at first by {self._leap_s:+.1f} s"
+            found["receipt"] = f"{times}, and stamps don't: did the recorder's clock? A bag that is written keeps them"
         share, axis = upright_share(rows[:, 2:5]), axis_of(rows[:, 2:5])
         if is_y_up and share < 0.5:
             along = f", heads are towards {axis}" if axis else ""
@@ -157,6 +173,8 @@ class Track:
 _NUMBERS = 8
 _SHORTEST_S, _LONGEST_S = 1e-3, 5.0
 """The shortest and longest plausible step between frames whose stamps are in nanoseconds [s]."""
+_LEAST_LEAP_S = 0.1
+"""Times of receipt may go back by this much where a recorder's threads overtake each other [s]."""
 
 
 class Doubts:

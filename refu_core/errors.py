@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 _MAX_TEXT = 300
 
@@ -43,6 +43,13 @@ def require_type(
     """Raises `error`, with what was `wanted` and what came, for a value of another type."""
     if not isinstance(value, kind):
         raise error(f"wanted {wanted}, got {type(value).__name__}")
+
+
+def require_pipeline(value: object, *needed: str, error: type[RefuError]) -> None:
+    """Raises `error` for anything but a `GarmentPipeline`, or a stand-in with the `needed` attributes."""
+    # An output has garments and a body, too.
+    if isinstance(value, Mapping) or not all(hasattr(value, name) for name in needed):
+        raise error(f"wanted a GarmentPipeline, got {type(value).__name__}")
 
 
 class FrameError(RefuError, ValueError):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from refu_core._numbers import NOT_NUMBERS, as_numbers, as_whole
 from refu_core.errors import FrameError
 
 N_JOINTS = 24
@@ -45,11 +45,8 @@ def checked_numbers(
     Raises `FrameError` for anything else, naming it `name`.
     """
     try:
-        given = np.ma.asanyarray(value) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
-        if given.dtype.kind not in "iufO":  # NumPy also turns booleans, text, dates and complex ones into numbers
-            raise TypeError(f"values of the type {given.dtype}")
-        array = np.ma.filled(given.astype(np.float64), np.nan)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:  # RuntimeError: a tensor with gradients
+        array = as_numbers(value).astype(np.float64)
+    except NOT_NUMBERS as error:
         raise FrameError(f"{name} must be {shape} numbers, got {type(value).__name__}: {error}") from error
     size = math.prod(shape)
     if array.size != size or array.shape not in (shape, (size,)):
@@ -84,12 +81,9 @@ def _direction(name: str, value: ArrayLike) -> NDArray[np.float32]:
 def _nanoseconds(name: str, value: Any) -> int:
     """`value` as a whole number."""
     try:
-        whole = int(value)
-        if isinstance(value, Real) and whole != value:  # seconds, most likely
-            raise ValueError("a fraction")
-    except (TypeError, ValueError, OverflowError) as error:
+        return as_whole(value)
+    except NOT_NUMBERS as error:
         raise FrameError(f"{name} must be a whole number of nanoseconds, got {value!r}") from error
-    return whole
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from refu_core._cache import remembered
+from refu_core._numbers import NOT_NUMBERS, as_numbers, as_whole
 from refu_core.errors import MeshError
 
 _Float = TypeVar("_Float", np.float32, np.float64)
@@ -46,7 +47,7 @@ class Connectivity:
     def of(cls, faces: Any, n_vertices: int | None = None) -> Connectivity:
         """For `faces`, integers of shape (F, 3), and by default as many vertices as they name; raises `MeshError`."""
         checked = check_faces(faces, n_vertices=n_vertices)
-        return _connectivity(checked, int(checked.max()) + 1 if n_vertices is None else n_vertices)
+        return _connectivity(checked, int(checked.max()) + 1 if n_vertices is None else int(n_vertices))
 
     @cached_property
     def _edges(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -138,7 +139,14 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
         raise MeshError(f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}")
     low, high = int(array.min()), int(array.max())
-    limit = n_vertices if n_vertices is not None else np.iinfo(np.int32).max
+    limit = most = int(np.iinfo(np.int32).max)
+    if n_vertices is not None:
+        try:
+            limit = as_whole(n_vertices)
+        except NOT_NUMBERS:
+            limit = -1
+        if not 0 <= limit <= most:
+            raise MeshError(f"wanted a number of vertices, 0 to {most}, got {n_vertices!r}")
     if low < 0 or high >= limit:
         raise MeshError(f"faces must index vertices 0 to {limit - 1}, got {low} to {high}")
     repeated = (array == np.roll(array, 1, axis=1)).any(axis=1)
@@ -168,9 +176,10 @@ def as_points(
     """`values` (a tensor, too) as contiguous, finite points, shape (n, 3). Raises `MeshError` for anything else."""
     shape = f"the shape ({'N' if n is None else n}, 3)"
     try:
-        points = np.ascontiguousarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise MeshError(f"{name} must be numbers of {shape}, got {type(values).__name__}") from error
+        given = as_numbers(values.detach().cpu() if hasattr(values, "detach") else values)
+        points = np.ascontiguousarray(given, dtype=dtype)
+    except NOT_NUMBERS as error:
+        raise MeshError(f"{name} must be numbers of {shape}, got {type(values).__name__}: {error}") from error
     if points.ndim != 2 or points.shape[1] != 3 or (n is not None and len(points) != n):
         raise MeshError(f"{name} must have {shape}, got {points.shape}")
     if not np.isfinite(points).all():

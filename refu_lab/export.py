@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from refu_core import GarmentPipeline, PipelineOutput
 from refu_core._files import replacing
-from refu_core.errors import RefuError
+from refu_core.errors import RefuError, require_type
 from refu_core.garments import UvMap
 from refu_core.recordings import turn_from
 from refu_lab.commands.replay import RecordingOptions
@@ -45,8 +45,18 @@ class ExportMesh:
 def meshes_of(
     pipeline: GarmentPipeline, outputs: PipelineOutput | Sequence[PipelineOutput], *, with_body: bool = True
 ) -> list[ExportMesh]:
-    """The body and the garments in one or T pipeline outputs of one person, with the translation added."""
+    """The body and the garments in one or T pipeline outputs of one person, with the translation added.
+
+    Raises `RefuError` for anything but outputs of this pipeline, or none.
+    """
     outputs = [outputs] if isinstance(outputs, PipelineOutput) else outputs
+    require_type(outputs, Sequence, "a pipeline's outputs")
+    for output in outputs:
+        require_type(output, PipelineOutput, "a pipeline's output of one person")
+        if output.keys() != pipeline.garments.keys():
+            raise RefuError(f"wanted outputs with {', '.join(pipeline.garments)}, got one with {', '.join(output)}")
+    if not outputs:
+        raise RefuError("wanted outputs of a pipeline, got none")
     found = []
     if with_body:
         bodies = np.stack([output.body + output.transl for output in outputs])

@@ -79,7 +79,7 @@ class Source:
         self.has_betas = self.has_betas or bool(frame.betas.any())
         self.has_style = self.has_style or frame.style is not None
         if self.bag is not None:
-            self.track.add(frame)
+            self.track.add(frame, received_ns=record.log_time_ns)
         if self.history is not None:
             frame = self.history(frame)
         betas = self.options.known_betas

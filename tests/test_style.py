@@ -24,6 +24,7 @@ CORE = (
         "_engine",
         "_files",
         "_npz",
+        "_numbers",
         "_cache",
         "_collector",
         "_device",

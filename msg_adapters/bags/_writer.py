@@ -13,6 +13,7 @@ from msg_adapters.bags import _metadata
 from msg_adapters.bags._mcap_writer import McapWriter
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
+from refu_core._numbers import NOT_NUMBERS, as_whole
 
 LIBRARY = "refu-ros"
 """The writer's name in a bag, within its first 64 bytes."""
@@ -122,10 +123,14 @@ class BagWriter:
         """
         if topic not in self._topics:
             raise BagError(f"{self.path}: {topic} isn't declared; call add_topic first")
-        if not 0 <= log_time_ns <= _metadata.MAX_TIME_NS:
-            raise BagError(f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns}")
+        try:
+            time_ns = as_whole(log_time_ns)
+        except NOT_NUMBERS:
+            time_ns = -1
+        if not 0 <= time_ns <= _metadata.MAX_TIME_NS:
+            raise BagError(f"{self.path}: a bag's times are nanoseconds in [0, 2^63), got {log_time_ns!r}")
         with self._writing():
-            self._writer.add_message(self._topics[topic].channel, data, log_time_ns=log_time_ns)
+            self._writer.add_message(self._topics[topic].channel, data, log_time_ns=time_ns)
 
     def sync(self) -> None:
         """Bring everything that was written so far to the disk, where it survives a power cut and can be read.

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import HEADER_BYTES, CdrWriter, split_stamp
 from msg_adapters.errors import DecodeError, EncodeError
+from msg_adapters.markers import numbers
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 POINT_FIELDS = ("normal", "clearance", "sigma", "vertex", "garment", "visible")
@@ -82,7 +84,7 @@ class PointCloudEncoder:
         """
         struct.pack_into("<iI", self._message.data, HEADER_BYTES + self._stamp_at, *split_stamp(stamp_ns))
         with np.errstate(over="ignore"):
-            moved = np.asarray(offset).astype(np.float32)
+            moved = numbers("offset", offset).astype(np.float32)
         self._write("vertices", self._place, vertices, moved)
         for name, column in self._columns.items():
             self._write(name, column, values[name])
@@ -92,7 +94,10 @@ class PointCloudEncoder:
         self, what: str, target: NDArray[Any], arrays: Sequence[ArrayLike], offset: NDArray[np.float32] = _NO_OFFSET
     ) -> None:
         for part, array in zip(self._slices, arrays, strict=True):
-            values = np.asarray(array)
+            try:
+                values = as_numbers(array, also="b")
+            except NOT_NUMBERS as error:
+                raise EncodeError(f"{what}: wanted numbers, got {type(array).__name__}: {error}") from error
             if values.shape != target[part].shape:
                 raise EncodeError(f"{what}: wanted numbers of shape {target[part].shape}, got {values.shape}")
             with np.errstate(invalid="ignore", over="ignore"):

@@ -55,7 +55,7 @@ def legs_share(pose: Tensor) -> Tensor:
 
 def _along(rotvec: Sequence[float]) -> tuple[float, float, float]:
     """Where a rotation vector [rad] turns the y axis."""
-    if not (angle := math.hypot(*rotvec)):
+    if not 0 < (angle := math.hypot(*rotvec)) < math.inf:
         return 0.0, 1.0, 0.0
     x, y, z = (one / angle for one in rotvec)
     sine, cosine = math.sin(angle), math.cos(angle)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from refu_core._device import checked_device
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.body._fingers import without_fingers
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, require_batch, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
@@ -318,7 +319,10 @@ def _tensor(name: str, value: ArrayLike | Tensor, device: torch.device) -> Tenso
     if isinstance(value, Tensor):
         return value.to(device)
     try:
-        array = np.asarray(value)  # torch knows no foreign byte order, and no negative strides
+        array = as_numbers(value, also="c")  # torch knows no foreign byte order, and no negative strides
+        if np.ma.is_masked(value):
+            raise ValueError("with masked values")
         return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C")).to(device)
-    except (TypeError, ValueError) as error:
-        raise FrameError(f"{name} must be an array or tensor of numbers, got {type(value).__name__}") from error
+    except NOT_NUMBERS as error:
+        got = f"{type(value).__name__}: {error}"
+        raise FrameError(f"{name} must be an array or tensor of numbers, got {got}") from error

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core._cache import remembered
-from refu_core._warp import Recorded, as_warp, ints, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
@@ -20,7 +20,7 @@ from refu_core.contact._sheet import Sheet
 from refu_core.mesh import Connectivity
 
 
-class Layer:
+class Layer(Unpicklable):
     """Brings one garment to the outer side of another one that is worn below it (docs/architecture.md).
 
     The repulsion is ReFU's (paper, Eq. 2) with a sheet in the place of the body, which the paper doesn't treat: where

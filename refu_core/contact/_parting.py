@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, as_warp, ints, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, torch_stream
 from refu_core.contact import _parting_kernels as kernels
 from refu_core.contact._settings import ContactSettings
 from refu_core.contact._sheet import Sheet, cut_of
@@ -16,7 +16,7 @@ from refu_core.mesh import Connectivity, grouped_at_rest
 from refu_core.sdf._crossing_kernels import BLOCK
 
 
-class Parting:
+class Parting(Unpicklable):
     """Parts one garment from another one that is worn below it, where their triangles cut each other.
 
     The caller takes two steps, in this order. Faces that cut are found, exactly. Then they are brought apart, each by

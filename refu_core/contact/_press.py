@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, as_warp, ints, memory, refit, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, refit, torch_stream
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._bundle_kernels import bound_kernel, enclose_kernel
 from refu_core.body._bundles import bundled
@@ -22,7 +22,7 @@ _LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 """Joints of each limb; both legs are one, as a skirt lies on either."""
 
 
-class LimbMeshes:
+class LimbMeshes(Unpicklable):
     """The limbs of one posed body, each a mesh of its own, shared by all garments on it."""
 
     def __init__(self, body: SmplBody) -> None:
@@ -57,7 +57,7 @@ class LimbMeshes:
         self._is_late[late] = False
 
 
-class Press:
+class Press(Unpicklable):
     """Keeps a garment between the skin that it lies on and the limbs that it doesn't lie on (docs/architecture.md).
 
     Where another limb comes between a vertex and its skin, the vertex is drawn back to the skin's side of it, and its

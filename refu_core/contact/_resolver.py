@@ -77,8 +77,8 @@ class Resolver(Unpicklable):
         """
         self._settings = settings
         self.device = faces.device if isinstance(faces, Tensor) else torch.device("cpu")
-        self._n_vertices = n = n_vertices
-        mesh = Connectivity.of(faces, n)
+        mesh = Connectivity.of(faces, n_vertices)
+        self._n_vertices = n = mesh.n_vertices
         self._n_edges = e = len(mesh.edges)
         self._cloth = _cloth(mesh, self.device)
         self._faces, self._glimpsed = ints(mesh.faces, self.device), None
@@ -120,6 +120,7 @@ class Resolver(Unpicklable):
             points: Garment vertices [m], shape (N, 3).
             sdf: The body's signed distance.
             start: What `sdf` says of the points; distances beyond `margin` + `ASKED_FROM` may be clipped from above.
+                Points of which it says NaN are queried.
                 None goes on from where the last call ended, if that was for the same body: only points that were moved
                 since, and may have come that near, are queried.
             margin: ε ≥ 0 [m].
@@ -285,7 +286,7 @@ class Resolver(Unpicklable):
         rules.max_pushes, rules.gap = how.max_pushes, how.gap
         each = n if self._is_serial else 1
         steps: dict[str, tuple[Any, list[Any]]] = {
-            "begin": (_resolver_kernels.begin_kernel, [each, state]),
+            "begin": (_resolver_kernels.begin_kernel, [each, state, skin]),
             "go on": (_resolver_kernels.go_on_kernel, [each, margin + ASKED_FROM, state, skin]),
             "compare": (_resolver_kernels.compare_kernel, [each, state, cloth, rules]),
             "retry": (_resolver_kernels.retry_kernel, [each, state, cloth, skin, rules]),

@@ -62,14 +62,20 @@ def suspect(i: int, state: State) -> None:
 
 
 @wp.kernel
-def begin_kernel(each: int, state: State) -> None:
+def begin_kernel(each: int, state: State, skin: Skin) -> None:
     """Starts every vertex where it is; `each` vertices a thread, as in every kernel for all vertices (`strips`)."""
     first = wp.tid() * each
     for i in range(first, first + each):
-        keep(i, state.origin[i], state.first[i], state.first_gradient[i], state.first_face[i], state)
-        state.fresh[i] = 1
+        here = state.origin[i]
         if state.first_face[i] < 0:
-            state.gradient[i] = wp.vec3()  # beyond a band nothing is known
+            state.first_gradient[i] = wp.vec3()  # beyond a band nothing is known
+        if not (state.first[i] > -wp.inf and wp.isfinite(state.first_gradient[i])):  # a caller's own may be NaN
+            distance, gradient, face = query_skin(skin, here, wp.max(state.first_face[i], 0))
+            state.first[i] = distance
+            state.first_gradient[i] = gradient
+            state.first_face[i] = face
+        keep(i, here, state.first[i], state.first_gradient[i], state.first_face[i], state)
+        state.fresh[i] = 1
 
 
 @wp.kernel

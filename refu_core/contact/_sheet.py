@@ -9,12 +9,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, as_warp, ints, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.mesh import Connectivity
 
 
-class Sheet:
+class Sheet(Unpicklable):
     """A mesh as kernels read it: places, box, tree and normals. These last three follow a pose when asked for."""
 
     def __init__(self, mesh: Connectivity, rest: Tensor) -> None:

@@ -6,14 +6,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, as_warp, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, memory, torch_stream
 from refu_core.contact import _strain_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import cut_of
 from refu_core.mesh import Connectivity
 
 
-class StrainLimit:
+class StrainLimit(Unpicklable):
     """Draws together the ends of edges that contact has made longer than a multiple of their rest length.
 
     Jacobi sweeps of position-based dynamics (Müller et al. 2007): edges pull by half of their excess length, and a

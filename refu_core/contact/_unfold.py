@@ -11,7 +11,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import Recorded, as_warp, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, memory, torch_stream
 from refu_core.body import PARENTS, JointWeights
 from refu_core.contact import _layers_kernels as layers
 from refu_core.contact import _unfold_kernels as kernels
@@ -20,7 +20,7 @@ from refu_core.contact._sheet import cut_of
 from refu_core.garments import GarmentTemplate
 
 
-class Unfold:
+class Unfold(Unpicklable):
     """Levels one garment where it has folded over: such a sheet has no outer side to bring another one to.
 
     Which way cloth faces without its folds is known: its normal at rest, turned as skinning turns the vertex. The

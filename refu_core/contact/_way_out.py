@@ -6,14 +6,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, as_warp, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, memory, torch_stream
 from refu_core.contact import _way_out_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import Sheet
 from refu_core.sdf import Winding
 
 
-class WayOut:
+class WayOut(Unpicklable):
     """Takes vertices that are inside a posed body, by winding number, to the closest skin that is outside of it.
 
     Faces with an interior above them are covered by another part of the body, and don't count. As a face may be covered

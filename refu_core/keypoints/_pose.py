@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core._npz import read_npz
-from refu_core.errors import BodyError
+from refu_core.errors import BodyError, FrameError, require_type
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.keypoints._layouts import KeypointLayout
 from refu_core.modes import BUILTIN_BODIES
@@ -110,9 +110,11 @@ class Pose:
 
 
 class Skeleton:
-    """The keypoints of a layout on a body."""
+    """The keypoints of a layout on a body. Raises `FrameError` for anything else."""
 
     def __init__(self, layout: KeypointLayout, proportions: Proportions) -> None:
+        require_type(layout, KeypointLayout, "a layout, as keypoint_layout gives", error=FrameError)
+        require_type(proportions, Proportions, "a body's Proportions", error=FrameError)
         self.layout = layout
         self.proportions = proportions
         above = np.maximum(_ABOVE, 0)

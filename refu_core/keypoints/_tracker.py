@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.errors import FrameError, as_before_if_it_fails, require_type
-from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame
+from refu_core.frames import N_BETAS, N_JOINTS, SmplFrame, checked_numbers
 from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3
 from refu_core.keypoints._solver import (
     BETAS,
@@ -52,9 +53,10 @@ class KeypointTracker:
     def __init__(
         self, skeleton: Skeleton, *, betas: ArrayLike | None = None, settings: TrackerSettings = DEFAULTS
     ) -> None:
+        require_type(skeleton, Skeleton, "a Skeleton", error=FrameError)
         self.skeleton = skeleton
         self._settings = settings
-        self._known = None if betas is None else np.asarray(betas, np.float64)
+        self._known = None if betas is None else checked_numbers("betas", betas, (N_BETAS,), np.float64)
         self._solver = Solver(skeleton, fits_betas=betas is None, settings=settings)
         layout = skeleton.layout
         joints, other = layout.joints, layout.mirrored
@@ -98,7 +100,7 @@ class KeypointTracker:
         require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
         seen = self._cleaned(points, confidence)
         with as_before_if_it_fails(self):
-            return self._updated(seen, stamp_ns)
+            return self._updated(seen, int(stamp_ns))
 
     def _updated(self, seen: _Seen, stamp_ns: int) -> SmplFrame | None:
         dt = 1e-9 * (stamp_ns - self._stamp)
@@ -126,8 +128,10 @@ class KeypointTracker:
     def at(self, stamp_ns: int) -> SmplFrame | None:
         """The pose at another time, before the next keypoints: rates continue, and die away.
 
-        None if nobody was seen for `hold`.
+        None if nobody was seen for `hold`. Raises `FrameError` for a time that isn't one.
         """
+        require_type(stamp_ns, Integral, "a whole number of nanoseconds", error=FrameError)
+        stamp_ns = int(stamp_ns)
         if not self._is_here or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None
         coast = self._settings.coast
@@ -142,9 +146,9 @@ class KeypointTracker:
     def _cleaned(self, points: ArrayLike, confidence: ArrayLike | None) -> _Seen:
         n = len(self.skeleton.layout)
         try:
-            given = np.asarray(points, np.float64)
-            weights = np.ones(n) if confidence is None else np.asarray(confidence, np.float64).copy()
-        except (TypeError, ValueError) as error:
+            given = as_numbers(points).astype(np.float64)
+            weights = np.ones(n) if confidence is None else as_numbers(confidence, also="b").astype(np.float64)
+        except NOT_NUMBERS as error:
             raise FrameError(f"wanted {n} keypoints of {self.skeleton.layout.name} as numbers: {error}") from error
         if given.shape != (n, 3) or weights.shape != (n,):
             msg = f"wanted {n} keypoints of {self.skeleton.layout.name}, got {given.shape} and {weights.shape}"

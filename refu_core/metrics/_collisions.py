@@ -77,7 +77,7 @@ def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles,
     return Crossings(np.ascontiguousarray(rows[:, :2]), bits[:, :3], bits[:, 3:])
 
 
-class SheetChecker:
+class SheetChecker(Unpicklable):
     """A garment as an open sheet: where it cuts through itself or another one."""
 
     def __init__(self, faces: Any) -> None:

@@ -7,9 +7,10 @@ import torch
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core._warp import as_warp, ints
 from refu_core.body import blend_transforms
-from refu_core.errors import FrameError, as_before_if_it_fails, require_type
+from refu_core.errors import FrameError, as_before_if_it_fails, require_pipeline, require_type
 from refu_core.frames import SmplFrame
 from refu_core.observation._cloth import (
     DEFAULT_OBSERVATION,
@@ -48,7 +49,7 @@ class Observer:
 
         Raises `FrameError` for no pipeline, or no settings.
         """
-        require_type(pipeline, GarmentPipeline, "a GarmentPipeline", error=FrameError)
+        require_pipeline(pipeline, "garments", "body", "adjusted", error=FrameError)
         require_type(settings, ObservationSettings, "ObservationSettings", error=FrameError)
         self._pipeline, self._settings = pipeline, settings
         self._cloths = {name: ObservedCloth(garment, settings) for name, garment in pipeline.garments.items()}
@@ -203,9 +204,11 @@ def _to_root(turn: RootTurn, points: NDArray[np.float64]) -> NDArray[np.float64]
 def _finite(name: str, value: ArrayLike, ndim: int) -> NDArray[np.float64]:
     wanted = "(N, 3)" if ndim == 2 else "(3,)"
     try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise FrameError(f"{name} must be numbers of the shape {wanted}, got {type(value).__name__}") from error
+        array = as_numbers(value).astype(np.float64)
+    except NOT_NUMBERS as error:
+        raise FrameError(
+            f"{name} must be numbers of the shape {wanted}, got {type(value).__name__}: {error}"
+        ) from error
     if array.ndim != ndim or array.shape[-1] != 3 or not np.isfinite(array).all():
         msg = f"{name} must be finite numbers of the shape {wanted}, got {array.shape}; leave out what isn't measured"
         raise FrameError(msg)

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody
+from refu_core.errors import MeshError, require_pipeline
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import as_points
-from refu_core.outputs._worn import require_known, require_outfit, require_pipeline, require_worn
+from refu_core.outputs._worn import require_known, require_outfit, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.sdf import BandSdf
 
@@ -42,7 +43,7 @@ class Clearance:
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> Clearance:
         """For the outputs of a pipeline. Raises `MeshError` for anything else."""
-        require_pipeline(pipeline)
+        require_pipeline(pipeline, "garments", "body", error=MeshError)
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> dict[str, NDArray[np.float32]]:

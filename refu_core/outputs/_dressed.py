@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from refu_core.errors import MeshError
+from refu_core.errors import MeshError, require_pipeline
 from refu_core.frames import SmplFrame
 from refu_core.mesh import check_faces
 from refu_core.outputs._clearance import Clearance
@@ -21,7 +21,7 @@ from refu_core.outputs._openings import Opening, Openings
 from refu_core.outputs._planner import PlannerMesh
 from refu_core.outputs._sigma import Sigma
 from refu_core.outputs._visible import PinholeCamera, all_visible
-from refu_core.outputs._worn import require_known, require_pipeline
+from refu_core.outputs._worn import require_known
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 
@@ -61,7 +61,7 @@ class Fittings:
 
         Raises `MeshError` for no pipeline.
         """
-        require_pipeline(pipeline)
+        require_pipeline(pipeline, "garments", "body", error=MeshError)
         self.pipeline, self._weights = pipeline, weights
         self.garments = pipeline.garments
         self.names = tuple(self.garments)

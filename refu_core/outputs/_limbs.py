@@ -9,12 +9,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import as_warp, ints, memory
+from refu_core._warp import Unpicklable, as_warp, ints, memory
 from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody, part_of_faces
+from refu_core.errors import MeshError, require_pipeline
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_areas
 from refu_core.outputs import _limbs_kernels as kernels
-from refu_core.outputs._worn import require_outfit, require_pipeline, require_worn
+from refu_core.outputs._worn import require_outfit, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 
 PRESSED = DEFAULT_GAP + 0.003
@@ -42,7 +43,7 @@ class LimbContact:
     """Middle of that cloth, in the axes of the garments' `local` vertices [m], shape (3,)."""
 
 
-class LimbContacts:
+class LimbContacts(Unpicklable):
     """Finds the cloth that is pressed between parts of a body, by how far the collider had to give way.
 
     This is geometry alone: it doesn't know how stiff cloth or flesh is, so it can't give a force.
@@ -70,7 +71,7 @@ class LimbContacts:
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> LimbContacts:
         """For the outputs of a pipeline. Raises `MeshError` for anything else."""
-        require_pipeline(pipeline)
+        require_pipeline(pipeline, "garments", "body", error=MeshError)
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:

@@ -16,12 +16,12 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from refu_core._cache import keep, recall
 from refu_core.body import Surface
-from refu_core.errors import MeshError
+from refu_core.errors import MeshError, require_pipeline
 from refu_core.frames import SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import Connectivity, as_points, rim_of, symmetric_solver, vertex_areas
 from refu_core.outputs._simplify import CoarseSheet
-from refu_core.outputs._worn import require_garment, require_pipeline
+from refu_core.outputs._worn import require_garment
 from refu_core.realtime import GarmentPipeline
 from refu_core.skeleton import posed
 
@@ -182,7 +182,7 @@ class PlannerMesh:
         """
         require_garment(garment)
         numbers: tuple[object, ...] = max_triangles, half_thickness
-        are_numbers = all(isinstance(number, Real) for number in numbers)
+        are_numbers = all(isinstance(number, Real) and math.isfinite(number) for number in numbers)
         if not are_numbers or max_triangles < _LEAST_TRIANGLES or not 0 < half_thickness < math.inf:
             wanted = f"{_LEAST_TRIANGLES} triangles or more and a positive half thickness"
             raise MeshError(f"wanted {wanted}, got {max_triangles} and {half_thickness}")
@@ -214,7 +214,7 @@ class PlannerMesh:
 
         Raises `MeshError` as the constructor does, and where the pipeline has no such garment.
         """
-        require_pipeline(pipeline)
+        require_pipeline(pipeline, "garments", "body", "adjusted", error=MeshError)
         if not isinstance(garment, str) or garment not in pipeline.garments:
             raise MeshError(f"the pipeline has no garment {garment!r}: wanted one of {', '.join(pipeline.garments)}")
         template = pipeline.garments[garment]

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.backbones import SEEN_TILT
 from refu_core.body import SmplBody
-from refu_core.errors import FrameError, MeshError, WeightsError, require_type
+from refu_core.errors import FrameError, MeshError, WeightsError, require_pipeline, require_type
 from refu_core.frames import LAGS, N_JOINTS, SmplFrame
 from refu_core.garments import GarmentTemplate
 from refu_core.keypoints._pose import skew
-from refu_core.outputs._worn import require_garment, require_pipeline, require_worn
+from refu_core.outputs._worn import require_garment, require_worn
 from refu_core.realtime import GarmentPipeline, PipelineOutput
 from refu_core.skeleton import CARRIED
 from refu_core.weights import load_weights, save_weights, weights_folder
@@ -159,7 +160,7 @@ class Sigma:
 
         Raises `WeightsError` for a damaged file of σ, and `MeshError` for no pipeline.
         """
-        require_pipeline(pipeline)
+        require_pipeline(pipeline, "garments", "body", error=MeshError)
         self._body, self._garments = pipeline.body, pipeline.garments
         self.maps: dict[str, SigmaMap] = {}
         """By garment. One that no network drapes, or whose network wasn't measured, has `UNKNOWN_SIGMA`."""
@@ -180,8 +181,8 @@ class Sigma:
         A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as stated and the person
         hardly moves; σ is never NaN. Moving cloth is harder to predict: σ grows by its own size for each radian that
         joints have turned (`turned_of`), if the frame knows its past.
-        Raises `FrameError` for a covariance of another shape, not finite, too large, or with a negative variance, and
-        `MeshError` for anything but an output, and for an output with other garments.
+        Raises `FrameError` for anything but a frame, and for a covariance of another shape, not finite, too large, or
+        with a negative variance; `MeshError` for anything but an output, and for an output with other garments.
 
         Args:
             frame: the one that was dressed.
@@ -190,6 +191,7 @@ class Sigma:
                 independent; it is pushed through the kinematics.
             transl_covariance: of the translation [m²], shape (3, 3).
         """
+        require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
         require_worn(output, self._garments)
         pose = None
         if pose_covariance is not None:
@@ -226,8 +228,8 @@ _LARGEST = 1e12
 
 def _covariance(name: str, value: Any, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
     try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor that tracks gradients
+        array = as_numbers(value).astype(np.float64)
+    except NOT_NUMBERS:
         array = np.full(0, np.nan)
     if array.shape not in shapes or not np.isfinite(array).all():
         wanted, got = " or ".join(map(str, shapes)), array.shape if array.size else type(value).__name__

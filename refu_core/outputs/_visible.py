@@ -142,6 +142,9 @@ def all_visible(
 
 def _buffered(camera: PinholeCamera, width: int) -> PinholeCamera:
     """The camera at the resolution of the depth buffer, however tall its picture is."""
+    require_type(width, Real, "the buffer's width as a number of pixels", error=MeshError)
+    if not 1 <= width < math.inf:
+        raise MeshError(f"the buffer's width must be a number of pixels, 1 at least, got {width}")
     return camera.scaled(min(camera.width, width, max(_TALLEST * width * camera.width // camera.height, 1)))
 
 

@@ -9,13 +9,6 @@ from refu_core.errors import MeshError, require_type
 from refu_core.garments import GarmentTemplate
 
 
-def require_pipeline(pipeline: object) -> None:
-    """Raises `MeshError` for anything but a pipeline, or what stands in for one."""
-    # An output has garments and a body, too.
-    if isinstance(pipeline, Mapping) or not (hasattr(pipeline, "garments") and hasattr(pipeline, "body")):
-        raise MeshError(f"wanted a GarmentPipeline, got {type(pipeline).__name__}")
-
-
 def require_outfit(body: object, garments: object) -> None:
     """Raises `MeshError` for anything but a body and garments by name."""
     require_type(body, SmplBody, "a SmplBody, as load_body gives", error=MeshError)
@@ -32,8 +25,8 @@ def require_garment(garment: object) -> None:
 
 def require_worn(output: object, known: Collection[str]) -> None:
     """Raises `MeshError` for anything but a pipeline's output, and for a garment that isn't `known`."""
-    require_type(output, Mapping, "a pipeline's output of one person", error=MeshError)
-    assert isinstance(output, Mapping)
+    if not (isinstance(output, Mapping) and hasattr(output, "body")):
+        raise MeshError(f"wanted a pipeline's output of one person, got {type(output).__name__}")
     for name in output:
         require_known(name, known)
 

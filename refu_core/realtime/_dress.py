@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from torch import Tensor
 
 from refu_core.backbones import MAX_OFFSET, upright
 from refu_core.body import RigidTransforms, require_batch
-from refu_core.errors import FrameError, require_type
+from refu_core.errors import FrameError, MeshError, RefuError, require_type
 from refu_core.frames import LAGS, N_JOINTS, N_PAST
 from refu_core.realtime._turn import RootTurn
 from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer
 from refu_core.refu import VertexScale
+from refu_core.sdf import require_finite, require_tensor
 
 Lap = Callable[[str, str | None], None]
 """Called at the end of a stage, with its name and the garment's, if it was for one."""
@@ -85,6 +86,44 @@ def dress(
         drapes[name] = drape
         lap("backbone", name)
     return Dressed(body, posed.vertices, aside, drapes, turns, posed.transforms)
+
+
+def require_adjusted(given: object, predicted: Dressed) -> Dressed:
+    """`given`, which is `predicted` but for what its tensors say.
+
+    Raises `RefuError` for anything but a `Dressed` of as many persons with the same garments, and `MeshError` for
+    tensors of another shape or type, or with NaN in them: kernels would read beyond them, and cloth would be nowhere.
+    """
+    require_type(given, Dressed, "a Dressed from what adjusts it")
+    assert isinstance(given, Dressed)
+    require_type(given.drapes, Mapping, "garments by name from what adjusts them")
+    if given.drapes.keys() != predicted.drapes.keys():
+        wanted, got = (", ".join(map(str, one.drapes)) or "none" for one in (predicted, given))
+        raise RefuError(f"wanted all garments back from what adjusts them ({wanted}), got {got}")
+    if len(given.turns) != len(predicted.turns):
+        raise RefuError(f"wanted the turns of {len(predicted.turns)} persons back, got {len(given.turns)}")
+    _require_like("Dressed", given[:3], predicted[:3], Dressed._fields)
+    for name, drape in given.drapes.items():
+        require_type(drape, Drape, f"a Drape of {name} from what adjusts it")
+        _require_like(name, drape, predicted.drapes[name], Drape._fields)
+    return given
+
+
+def _require_like(
+    whose: str, given: Sequence[Tensor | None], wanted: Sequence[Tensor | None], fields: Sequence[str]
+) -> None:
+    for field, one, other in zip(fields, given, wanted, strict=False):
+        if one is other or (one is None and field == "feature"):
+            continue
+        name = f"{whose}'s {field}"
+        require_tensor(name, one)
+        assert isinstance(one, Tensor)
+        if other is None or (one.shape, one.dtype, one.device) != (other.shape, other.dtype, other.device):
+            like = None if other is None else f"{other.dtype} of the shape {tuple(other.shape)} on {other.device}"
+            got = f"{one.dtype} of the shape {tuple(one.shape)} on {one.device}"
+            raise MeshError(f"{name}: wanted {like} from what adjusts it, got {got}")
+        for row in one:
+            require_finite(name, row)
 
 
 def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from refu_core._warp import side_by_side
 from refu_core.body import Collider
-from refu_core.errors import MeshError, require_type
+from refu_core.errors import MeshError
 from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
-from refu_core.realtime._dress import Dressed, dress, scale_of
+from refu_core.realtime._dress import Dressed, dress, require_adjusted, scale_of
 from refu_core.realtime._wearer import Outfit, Wearer
 
 Adjust = Callable[[Dressed], Dressed]
@@ -98,8 +98,7 @@ class FrameStep:
         shared = StageClock()
         dressed = dress(pose, replace(wearer, outfit=self.outfit), past=past, up=up, lap=shared.lap)
         if adjust is not None:
-            dressed = adjust(dressed)
-            require_type(dressed, Dressed, "a Dressed from what adjusts it")
+            dressed = require_adjusted(adjust(dressed), dressed)
             shared.lap("adjust")
         margin_of = dict(zip(self.outfit.wearables, margins, strict=True))
         persons = []

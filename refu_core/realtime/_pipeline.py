@@ -233,7 +233,8 @@ class GarmentPipeline:
 
         Raises:
             FrameError: not a `SmplFrame`.
-            RefuError: as `__call__`, and what `adjust` raises.
+            RefuError: as `__call__`, what `adjust` raises, and for garments that it drops, or whose tensors have
+                another shape, or NaN in them.
         """
         require_type(frame, SmplFrame, "a SmplFrame", error=FrameError)
         given: object = adjust

@@ -65,6 +65,9 @@ def _check(points: Tensor, sample: SdfSample, scale: float | Tensor, margin: flo
             f"{tuple(sample.gradient.shape)} and {tuple(sample.distance.shape)}"
         )
         raise MeshError(msg)
+    if not points.dtype == sample.distance.dtype == sample.gradient.dtype:
+        got = f"{points.dtype} and {sample.distance.dtype}, {sample.gradient.dtype}"
+        raise MeshError(f"points and their sample must be of one type, got {got}: query points of that type")
     if isinstance(scale, Tensor) and scale.shape not in ((), (n,)):
         raise MeshError(f"scale must be one number or have the shape ({n},), got {tuple(scale.shape)}")
 

@@ -89,10 +89,15 @@ def query_batch(
     `vertices` (B, V, 3) [m] and are queried at `points` (B, N, 3) [m], with `near` faces (N,) for all or (B, N); `pose`
     (B, 24, 3) [rad] and `betas` (B, 10) are what they were posed by.
 
-    Raises `MeshError` for another number of bodies than of points, and as `sdf`.
+    Without bodies, B = 0, `sdf` isn't asked, and names no faces. Raises `MeshError` for another number of bodies than
+    of points, and as `sdf`.
     """
     if len(vertices) != len(points):
         raise MeshError(f"wanted points of {len(vertices)} bodies, (B, N, 3), got the shape {tuple(points.shape)}")
+    if not len(vertices):
+        if points.ndim != 3 or points.shape[2] != 3:
+            raise MeshError(f"wanted points (0, N, 3) of no bodies, got the shape {tuple(points.shape)}")
+        return SdfSample(points[..., 0] + vertices.sum(), points + vertices.sum())  # empty, with derivatives in both
     samples = []
     for i, (body, here) in enumerate(zip(vertices, points, strict=True)):
         sdf.update(body, pose=None if pose is None else pose[i], betas=None if betas is None else betas[i])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from small_set import write_set
 from torch import Tensor
 
-from refu_core import RefuError, load_body, load_garment
+from refu_core import GarmentPipeline, RefuError, Wearer, dress, load_body, load_garment
 from refu_core.backbones import (
     KINDS,
     BasisDecoder,
@@ -195,3 +196,15 @@ def test_no_such_kind(folder: Path) -> None:
 
 def test_the_command_knows_every_kind() -> None:
     assert set(BEYOND) == set(KINDS)
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_a_pose_that_is_none_makes_no_error_of_its_own(value: float) -> None:
+    """The functions of tensors give NaN for it; an infinite one ended in a *math domain error*."""
+    outfit = GarmentPipeline.load(["tshirt-male"], collider=False).outfit
+    pose = torch.zeros(2, 24, 3)
+    pose[0, 0, 1] = value
+    wearer = Wearer.of(outfit, torch.zeros(2, 10))
+    worn = dress(pose, wearer).drapes["tshirt-male"].vertices
+    assert bool(worn[0].isnan().any())
+    torch.testing.assert_close(worn[1], dress(torch.zeros_like(pose), wearer).drapes["tshirt-male"].vertices[1])

@@ -101,6 +101,24 @@ def test_points_of_an_outer_garment_move_no_inner_one(pipeline: GarmentPipeline)
     assert observer.matched[NAME] < 0.2 * observer.matched["tshirt-male"]
 
 
+def test_what_stands_in_for_a_pipeline_is_taken(pipeline: GarmentPipeline) -> None:
+    """The outputs took it, and an observer wanted the very class."""
+
+    class Counted:
+        n = 0
+
+        def __getattr__(self, name: str) -> object:
+            Counted.n += name == "adjusted"
+            return getattr(pipeline, name)
+
+    frame = SmplFrame(pose=np.zeros((24, 3)))
+    out = Observer(Counted())(frame)  # type: ignore[arg-type]
+    assert Counted.n
+    assert np.array_equal(out[NAME].vertices, Observer(pipeline)(frame)[NAME].vertices)
+    with pytest.raises(FrameError, match="wanted a GarmentPipeline, got PipelineOutput"):
+        Observer(out)  # type: ignore[arg-type]
+
+
 def test_without_points_it_is_the_prediction(
     pipeline: GarmentPipeline, observer: Observer, moments: list[TrueFrame]
 ) -> None:

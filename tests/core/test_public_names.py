@@ -121,6 +121,7 @@ SAMPLE = SdfSample(torch.zeros(3), torch.zeros(3, 3))
             lambda: query_batch(posed(), CORNERS[None], CORNERS),
             r"wanted points of 1 bodies, .*, got the shape \(4, 3\)",
         ),
+        (lambda: query_batch(posed(), CORNERS[None][:0], CORNERS[:0]), r"wanted points \(0, N, 3\) .* shape \(0, 3\)"),
         (lambda: Refu(3, least="1"), "wanted a least scale of 0 to 1, got str"),
         (lambda: Refu(3, least=np.nan), "a least scale of 0 to 1, got 0.004 m and nan"),
         *(

@@ -206,6 +206,27 @@ def test_points_that_are_none_are_refused_and_faces_may_be_arrays() -> None:
         Resolver(garment.faces, len(points))(points, sdf, start)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("field", "value"), [("distance", math.nan), ("distance", -math.inf), ("gradient", math.nan)])
+def test_a_start_with_nan_in_it_is_asked_anew(kind: str, field: str, value: float) -> None:
+    """It was trusted: gradients, the depth and the distances that the next call went on from were NaN."""
+    body, unposed, points = dressed("short-pant-male", 0.3, 0.01)
+    sdf = distance("short-pant-male", kind)
+    sdf.update(body)
+    start = sdf.query(points, near=RestFaces(worn("short-pant-male")[0])(unposed[0]) if kind == "approx" else None)
+    resolver = worn("short-pant-male")[2]
+    right = resolver(points, sdf, start)
+    assert start.face is not None
+    deepest = start.distance.argsort()[:9]
+    wrong = getattr(start, field).clone()
+    wrong[deepest] = value
+    done = resolver(points, sdf, start._replace(**{field: wrong}))
+    for one, other in zip(done, right, strict=True):
+        assert bool(one.isfinite().all())
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
+    assert bool(resolver(done.vertices, sdf, None).gradient.isfinite().all())
+
+
 @pytest.mark.parametrize("given", [{"gap": 0.0}, {"gap": math.nan}, {"around": 3}, {"levellings": 47}])
 def test_settings_that_never_end_or_end_elsewhere_are_refused(given: dict[str, float]) -> None:
     with pytest.raises(MeshError, match=str(next(iter(given.values())))):

@@ -269,6 +269,17 @@ def test_a_batch_is_its_bodies_and_keeps_their_derivatives(body: SmplBody, appro
     assert one_hint.distance.shape == worn.shape[:2]
 
 
+def test_a_batch_without_bodies_is_empty(body: SmplBody) -> None:
+    skins, points = (torch.zeros(0, n, 3, requires_grad=True) for n in (body.n_vertices, 5))
+    none = query_batch(ExactSdf(body.faces), skins, points)
+    assert none.distance.shape == (0, 5)
+    assert none.gradient.shape == (0, 5, 3)
+    assert [one.shape for one in torch.autograd.grad(none.distance.sum(), (skins, points))] == [
+        skins.shape,
+        points.shape,
+    ]
+
+
 def test_satisfies_the_protocol_and_says_what_is_wrong(body: SmplBody) -> None:
     sdf = ApproxSdf(body)
     assert isinstance(sdf, BodySdf)

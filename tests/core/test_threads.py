@@ -20,11 +20,13 @@ import numpy as np
 import pytest
 import torch
 
-from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body
+from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
 from refu_core._warp import Recorded
 from refu_core.body import Collider
-from refu_core.contact import Resolver
-from refu_core.metrics import CollisionChecker, SelfContactDetector
+from refu_core.contact import Layer, LimbMeshes, Press, Resolver, Sheet, StrainLimit, Unfold, WayOut
+from refu_core.mesh import Connectivity
+from refu_core.metrics import CollisionChecker, SelfContactDetector, SheetChecker
+from refu_core.outputs import LimbContacts
 from refu_core.realtime import Dressed, PipelineOutput
 from refu_core.realtime._frame import FrameStep
 from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf
@@ -310,7 +312,19 @@ def test_what_holds_memory_of_warp_says_that_it_cannot_leave_its_process() -> No
     body = load_body("male")
     there = [ExactSdf(body.faces), BandSdf(body.faces), ApproxSdf(body), Resolver(body.faces, body.n_vertices)]
     checkers = [CollisionChecker(body.faces), SelfContactDetector(body.faces, body.v_template), Collider(body)]
-    for one in [*there, *checkers]:
+    shorts, shirt = load_garment("short-pant-male"), load_garment("tshirt-male")
+    sheet = Sheet(Connectivity.of(body.faces, body.n_vertices), body.v_template)
+    layer = Layer(shirt.faces, shirt.v_template, shorts.faces, shorts.v_template)
+    steps = [sheet, layer, layer.parting, StrainLimit(shorts.mesh, body.device), Unfold(shorts, [shirt]), WayOut(sheet)]
+    limbs = LimbMeshes(body)
+    checkers += [
+        *steps,
+        limbs,
+        Press(shorts, limbs),
+        SheetChecker(shorts.faces),
+        LimbContacts(body, {"shorts": shorts}),
+    ]
+    for one in [*there, *checkers, *steps]:
         for leave in (pickle.dumps, copy.copy, copy.deepcopy):
             with pytest.raises(RefuError, match=f"^{type(one).__name__} can't be copied"):
                 leave(one)

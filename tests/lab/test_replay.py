@@ -31,7 +31,9 @@ from refu_core.garments import BUILTIN_GARMENTS, PAPER_GARMENTS
 from refu_core.modes import ONE_STYLE
 from refu_core.simulation import posture
 from refu_lab.cli import main
+from refu_lab.commands.replay import ReplayOptions
 from refu_lab.dressed_bag import DressedBag
+from refu_lab.replay import replay
 
 BAGS = Path(__file__).parents[2] / "bags"
 SHIPPED = [BAGS / "walk", BAGS / "reach_squat"]
@@ -80,6 +82,27 @@ def decoded(path: Path, *topics: str) -> list[tuple[str, int, Any]]:
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         return [(channel.topic, m.log_time, ros) for _, channel, m, ros in reader.iter_decoded_messages(topics or None)]
+
+
+@pytest.mark.parametrize(
+    ("late_s", "said"),
+    [
+        ([0, 0, -3600, -3600, 0, 0], "leap in 2 of 6 frames, at first by -3600.0 s"),
+        ([0, 0, 0, 60, 60, 60], "leap in 1 of 6 frames, at first by +60.0 s"),
+        ([0, 1, 2, 1.95, 1.93, 3], None),
+    ],
+)
+def test_times_of_receipt_that_leap_are_said(late_s: list[float], said: str | None, tmp_path: Path) -> None:
+    """A bag whose stamps are fine replayed without a word, and so did what was made of it, an hour off."""
+    encode = adapters.encoder_for("joint_state")
+    with adapters.BagWriter(tmp_path / "leaps.mcap") as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES["joint_state"])
+        for frame, late in zip(motion(), late_s, strict=True):
+            writer.write("/smpl_params", encode(frame), log_time_ns=frame.stamp_ns + round(1e9 * late))
+    options = ReplayOptions(input=tmp_path / "leaps.mcap", garments=["short-pant-male"], evaluate=False)
+    warnings = [text for text in replay(options).warnings if "receipt" in text]
+    assert len(warnings) == (said is not None)
+    assert said is None or said in warnings[0]
 
 
 def test_as_many_garments_as_frames_and_stamps_kept(small_bag: Path, tmp_path: Path) -> None:
