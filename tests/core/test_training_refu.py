@@ -38,7 +38,7 @@ from refu_core.training import _loop as loop_module
 from refu_core.training._data import TrainingSet
 from refu_core.training._dresser import Dresser
 from refu_core.training._finetune import FINETUNE_MODES
-from refu_core.training._pretrain import MANY
+from refu_core.training._pretrain import MANY, SOME
 from refu_core.weights import load_weights
 
 GARMENT = "short-pant-male"
@@ -284,8 +284,10 @@ def test_a_gcnn_has_as_much_training_with_refu_as_alone() -> None:
     assert (together.loop, together.steps) == (alone.loop, alone.steps)
     assert FinetuneSettings.of("gcnn", "paper") == FinetuneSettings.paper()
     assert FinetuneSettings.of("tailornet") == FinetuneSettings()
-    assert PretrainSettings.of("mlp") == PretrainSettings.of("tailornet", samples=MANY - 1) == PretrainSettings()
-    many = PretrainSettings.of("tailornet", samples=MANY)
+    assert PretrainSettings.of("mlp") == PretrainSettings.of("tailornet", samples=SOME - 1) == PretrainSettings()
+    some, many = (PretrainSettings.of("tailornet", samples=samples) for samples in (SOME, MANY))
+    assert some.steps == many.steps > PretrainSettings().steps
+    assert some.loop == PretrainSettings().loop
     assert many.loop.weight_decay < PretrainSettings().loop.weight_decay
 
 
