@@ -46,6 +46,12 @@ class SmplBag:
         """Messages of the topic."""
         return self.topic.message_count
 
+    def __enter__(self) -> SmplBag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is open between iterations."""
+
     def __iter__(self) -> Iterator[FrameRecord]:
         for message in self.reader.messages({self.topic.name}):
             frame, error = None, None
