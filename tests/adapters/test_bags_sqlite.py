@@ -75,7 +75,9 @@ def test_directory_and_file_of_another_writer(bag: Path) -> None:
         assert not reader.truncated
         assert not reader.warnings
     decode = decoder_for("joint_state").from_bytes
-    for record, data in zip(open_smpl_bag(bag), PAYLOADS, strict=True):
+    with open_smpl_bag(bag) as records:
+        found = list(records)
+    for record, data in zip(found, PAYLOADS, strict=True):
         assert record.frame is not None
         np.testing.assert_array_equal(record.frame.pose, decode(data).pose)
 
