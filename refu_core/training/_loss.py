@@ -9,7 +9,7 @@ from torch import Tensor
 
 from refu_core import backbones as nets
 
-_SOME = 1000
+_COMPARED = 1000
 """Vertices at which garments are compared. With 600 and with 2,000 a T-shirt's test error is the same."""
 
 
@@ -25,7 +25,7 @@ class VertexError:
         """Of garments that `decoder` makes from codes."""
         self._decoder = decoder
         drawn = torch.randperm(decoder.n_vertices, generator=torch.Generator().manual_seed(0))
-        self._some = drawn[:_SOME].sort().values
+        self._some = drawn[:_COMPARED].sort().values
 
     def targets(self, displacement: Tensor) -> Tensor:
         """What is compared of displacements (N, V, 3) [m], shape (N, 3 S)."""
@@ -33,22 +33,11 @@ class VertexError:
 
     def __call__(self, codes: Tensor, targets: Tensor) -> Tensor:
         """The mean over codes (B, C) and their `targets` (B, 3 S)."""
+        # Taken anew: the decoder may have gone to a GPU.
         components = self._decoder.components.view(len(self._decoder.components), -1, 3)[:, self._some].flatten(1)
         apart = (codes @ components - targets).unflatten(1, (-1, 3))
         error: Tensor = 1e3 * apart.norm(dim=2).mean()
         return error
-
-
-class DenseError:
-    """The same for dense codes, which are vertices: L1, as in the original."""
-
-    def targets(self, displacement: Tensor) -> Tensor:
-        """Codes (N, 3 V) of displacements (N, V, 3) [m]."""
-        return displacement.flatten(1)
-
-    def __call__(self, codes: Tensor, targets: Tensor) -> Tensor:
-        """The mean over codes and `targets`, both (B, 3 V)."""
-        return vertex_loss(codes, targets)
 
 
 def code_loss(model: nets.TailorNet | nets.Mlp | nets.Beyond) -> Callable[[Tensor, Tensor], Tensor]:

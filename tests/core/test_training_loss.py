@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 
 from refu_core.backbones import BasisDecoder
+from refu_core.backbones._decoder import DenseDecoder
 from refu_core.training import _loss as loss_module
-from refu_core.training._loss import DenseError, VertexError
+from refu_core.training._loss import VertexError, vertex_loss
 
 N, RANK = 40, 6
 
@@ -28,13 +29,13 @@ def test_the_error_is_the_mean_distance_of_vertices_in_millimetres() -> None:
 
 
 def test_large_garments_are_compared_at_some_vertices_spread_over_all_of_them() -> None:
-    n = 20 * loss_module._SOME
+    n = 20 * loss_module._COMPARED
     basis = BasisDecoder(torch.zeros(n, 3), torch.eye(1, 3 * n))
     error = VertexError(basis)
     displacement = torch.zeros(1, n, 3)
     displacement[0, :, 0] = torch.linspace(0, 1, n)  # its mean distance from nothing is half a metre
     targets = error.targets(displacement)
-    assert targets.shape == (1, 3 * loss_module._SOME)
+    assert targets.shape == (1, 3 * loss_module._COMPARED)
     assert abs(float(error(torch.zeros(1, 1), targets)) - 500) < 30
 
 
@@ -65,5 +66,4 @@ def test_nothing_is_wrong_with_a_network_that_is_right() -> None:
 
 def test_dense_codes_are_compared_coordinate_by_coordinate() -> None:
     truth = torch.tensor([[[0.001, 0.002, -0.003]]])
-    error = DenseError()
-    torch.testing.assert_close(error(torch.zeros(1, 3), error.targets(truth)), torch.tensor(2.0))
+    torch.testing.assert_close(vertex_loss(torch.zeros(1, 3), DenseDecoder(1).encode(truth)), torch.tensor(2.0))
