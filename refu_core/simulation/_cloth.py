@@ -125,6 +125,47 @@ _MAX_SPEED = 6.0  # [m/s]
 _APART = 10.0  # [m]: separate pieces are taken to be this far apart at rest, so they are never neighbours
 
 
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """A garment as cloth: what one shape and style of it has, in any pose, for C distance constraints."""
+
+    told_apart: F32
+    """The rest shape, with separate pieces far apart [m], shape (N, 3)."""
+    shortest: F32
+    """Between these two lengths a constraint gives way freely [m], shape (C,)."""
+    longest: F32
+    edge_length: float
+    """Median length of an edge [m]."""
+    inverse_mass: F32
+    """[1/kg], shape (N,)."""
+    anchored: I32
+    """Vertices that are held at the skin, shape (A,)."""
+    anchors: tuple[I32, F32, F32]
+    """For each of them the face of the body (A,), weights of its corners (A, 3), distance from it [m] (A, 1)."""
+
+    def stretch(self, topology: ClothTopology, positions: F32) -> float:
+        """99.9th percentile of edge length over the length reached freely, of `positions` (N, 3) [m]."""
+        i, j = topology.edges.T
+        length = np.linalg.norm(positions[i] - positions[j], axis=1)
+        return float(np.percentile(length / self.longest[-len(length) :], 99.9))
+
+
+@dataclass(frozen=True)
+class Step:
+    """One frame of simulated time."""
+
+    before: int
+    """Number of the body at its start: the body goes straight from one to the other."""
+    after: int
+    """Number of the body at its end; the same where the body rests."""
+    gravity: F32
+    """Acceleration [m/s²], shape (3,)."""
+    drag: float
+    """Rate at which the velocity fades [1/s]."""
+    is_careful: bool = False
+    """Whether contacts of edge midpoints are solved, too, and contacts searched for as often as on a moving body."""
+
+
 class _Skin:
     """The closest place on the skin to each of N points, as of the point's last query."""
 
@@ -172,17 +213,10 @@ class SimulatedCloth:
         self.velocities: F32 = np.zeros((n, 3), np.float32)
         self._previous: F32 = np.zeros((n, 3), np.float32)
 
-    def start(
-        self,
-        rest: F32,
-        positions: F32,
-        *,
-        eased: Sequence[F32],
-        crooks: Sequence[F32],
-        waist: NDArray[np.intp],
-        body_rest: F32,
-    ) -> None:
-        """Puts the cloth at `positions` (N, 3), at rest, with the rest lengths and masses of `rest` (N, 3).
+    def cut(
+        self, rest: F32, *, eased: Sequence[F32], crooks: Sequence[F32], waist: NDArray[np.intp], body_rest: F32
+    ) -> Cut:
+        """The cloth of a garment whose rest shape is `rest` (N, 3) [m].
 
         Where an edge is longer in one of the shapes `eased`, (N, 3) each, it may lengthen freely to that length, within
         limits; where it is shorter in one of `crooks`, it may shorten freely to that length.
@@ -190,27 +224,34 @@ class SimulatedCloth:
         `waist` vertices are held at the place on the skin that is closest to them in the rest pose: the body at rest is
         `body_rest` (V, 3).
         """
-        n, n_edges = len(rest), len(self.topology.mesh.edges)
-        self._told_apart: F32 = rest + np.float32(_APART) * self._piece[:, None].astype(np.float32)
-        self._skin, self._middles = _Skin(n), _Skin(n_edges)
-        self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: the first call searches
-        self.positions[:] = positions
-        self.velocities[:] = 0
+        n_edges = len(self.topology.mesh.edges)
         length = self._lengths(rest)
         longest = np.maximum.reduce([length, *(self._lengths(shape) for shape in eased)])
         shortest = np.minimum.reduce([length, *(self._lengths(shape) for shape in crooks)])
-        self._longest = np.minimum(longest, length * np.float32(1 + self.settings.most_ease))
-        self._shortest = np.maximum(shortest, length * np.float32(1 - self.settings.most_crease))
-        self._edge_length = float(np.median(length[-n_edges:]))
         area = vertex_areas(rest, self.topology.mesh.faces)
         # Slivers would get next to no mass and soak up every correction of their neighbours.
         area = np.maximum(area, 0.25 * np.median(area))
-        self._inverse_mass: F32 = (1 / (self.settings.density * area)).astype(np.float32)
         self._sdf.update(torch.from_numpy(body_rest))
         found = self._sdf.closest(torch.from_numpy(rest[waist]))
         offset = np.maximum(found.distance.numpy() * found.sign.numpy(), self.settings.margin + 0.002)
-        self._anchored = waist.astype(np.int32)
-        self._anchors = found.face.numpy(), found.barycentrics.numpy(), offset[:, None].astype(np.float32)
+        return Cut(
+            told_apart=rest + np.float32(_APART) * self._piece[:, None].astype(np.float32),
+            shortest=np.maximum(shortest, length * np.float32(1 - self.settings.most_crease)),
+            longest=np.minimum(longest, length * np.float32(1 + self.settings.most_ease)),
+            edge_length=float(np.median(length[-n_edges:])),
+            inverse_mass=(1 / (self.settings.density * area)).astype(np.float32),
+            anchored=waist.astype(np.int32),
+            anchors=(found.face.numpy(), found.barycentrics.numpy(), offset[:, None].astype(np.float32)),
+        )
+
+    def start(self, cut: Cut, positions: F32) -> None:
+        """Puts cloth of this cut at `positions` (N, 3) [m], at rest."""
+        n = len(positions)
+        self._cut = cut
+        self._skin, self._middles = _Skin(n), _Skin(len(self.topology.mesh.edges))
+        self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: the first call searches
+        self.positions[:] = positions
+        self.velocities[:] = 0
 
     def _lengths(self, shape: F32) -> F32:
         """Lengths of the distance constraints in a shape (N, 3)."""
@@ -219,7 +260,7 @@ class SimulatedCloth:
         return length
 
     def _anchor_points(self, body: F32) -> F32:
-        face, weights, offset = self._anchors
+        face, weights, offset = self._cut.anchors
         a, b, c = body[self._body_faces[face]].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
@@ -257,11 +298,11 @@ class SimulatedCloth:
             pairs = self._pairs()
             for _ in range(min(refresh, s.substeps - first)):
                 substep(
-                    self.positions, self.velocities, self._previous, self._inverse_mass,
-                    self._ends, self._shortest, self._longest, self._softness,
+                    self.positions, self.velocities, self._previous, self._cut.inverse_mass,
+                    self._ends, self._cut.shortest, self._cut.longest, self._softness,
                     h, gravity, np.float32(np.exp(-drag * s.substep)),
                     *contacts, np.float32(s.margin), np.float32(s.friction),
-                    self._anchored, anchor, anchor_motion, np.float32(s.anchor_stiffness),
+                    self._cut.anchored, anchor, anchor_motion, np.float32(s.anchor_stiffness),
                     *pairs, np.float32(s.thickness),
                     *edges, np.float32(s.edge_margin),  # type: ignore[arg-type]  # mypy loses count after two unpackings
                     s.iterations, np.float32(_MAX_SPEED * s.substep),
@@ -272,10 +313,10 @@ class SimulatedCloth:
         """Vertices near a face that they aren't near in the rest shape, the face, and the vertex's side of it."""
         from refu_core.simulation._solver import find_candidates, near_pairs
 
-        faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._edge_length)
+        faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._cut.edge_length)
         if float(np.sqrt(np.square(self.positions - self._searched_at).sum(1).max())) > _PAIR_SLACK / 2:
-            rest_apart, cell = np.float32(2.2 * self._edge_length), reach + np.float32(_PAIR_SLACK)
-            self._candidates = find_candidates(self.positions, faces, self._told_apart, rest_apart, cell)
+            rest_apart, cell = np.float32(2.2 * self._cut.edge_length), reach + np.float32(_PAIR_SLACK)
+            self._candidates = find_candidates(self.positions, faces, self._cut.told_apart, rest_apart, cell)
             self._searched_at[:] = self.positions
         return near_pairs(self.positions, faces, *self._candidates, np.float32(_PAIR_REACH))
 
@@ -307,7 +348,5 @@ class SimulatedCloth:
         )  # fmt: skip
 
     def stretch(self, positions: F32 | None = None) -> float:
-        """99.9th percentile of edge length over the length reached freely; of `positions` (N, 3) [m], if given."""
-        edges = slice(-len(self.topology.edges), None)
-        length = self._lengths(self.positions if positions is None else positions)[edges]
-        return float(np.percentile(length / self._longest[edges], 99.9))
+        """As `Cut.stretch`, of the cloth where it is, or of `positions` (N, 3) [m]."""
+        return self._cut.stretch(self.topology, self.positions if positions is None else positions)

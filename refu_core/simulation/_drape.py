@@ -8,6 +8,7 @@ takes a fixed path to its own pose: the result is a function of (β, θ, γ) alo
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,7 +25,7 @@ from refu_core.mesh import Connectivity
 from refu_core.metrics import SheetChecker
 from refu_core.realtime import RootTurn
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._cloth import F32, ClothSettings, ClothTopology, SimulatedCloth
+from refu_core.simulation._cloth import F32, ClothSettings, ClothTopology, Cut, SimulatedCloth, Step
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.skeleton import posed
 
@@ -178,6 +179,66 @@ class SettledDrape:
     """99.9th percentile of edge length over the length that the edge reaches freely."""
 
 
+_DOWN = np.array([0, -GRAVITY, 0])
+_FEWEST = 10
+"""Fewest frames in which the canonical drape settles."""
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What happens to a body and the cloth on it, frame by frame, until the cloth rests."""
+
+    bodies: F32
+    """The body from frame to frame of its move, its start first [m], shape (T + 1, V, 3)."""
+    gravity: NDArray[np.floating]
+    """Acceleration at each of them [m/s²], shape (T + 1, 3)."""
+    drag: tuple[float, float, float]
+    """As in `DrapeSettings`."""
+    settle: tuple[int, int]
+    """Fewest and most frames of settling."""
+    rest_speed: float
+    """It ends early below this root mean square speed [m/s]."""
+    careful: int
+    """Careful frames after that."""
+    dress: int = 0
+    """Frames before the move in which the template becomes cloth."""
+
+    def steps(self) -> Generator[Step, float, None]:
+        """The frames, one by one; the speed that the cloth has after each is to be sent [m/s]."""
+        gravity, last = self.gravity.astype(np.float32), len(self.bodies) - 1
+        dressing, moving, settling = self.drag
+        for _ in range(self.dress):
+            yield Step(0, 0, gravity[0], dressing)
+        for k in range(last):
+            yield Step(k, k + 1, gravity[k + 1], moving)
+        fewest, most = self.settle
+        for settled in range(1, most + 1):
+            speed = yield Step(last, last, gravity[-1], settling)
+            if speed < self.rest_speed and settled >= fewest:
+                break
+        for _ in range(self.careful):
+            yield Step(last, last, gravity[-1], settling, is_careful=True)
+
+
+def follow(cloth: SimulatedCloth, course: Course) -> float:
+    """Takes the cloth along a course, and returns the speed at its end [m/s]."""
+    steps, bodies, speed = course.steps(), list(course.bodies), math.inf
+    step = next(steps, None)
+    while step is not None:
+        before, after = bodies[step.before], bodies[step.after]
+        speed = cloth.frame(before, after, gravity=step.gravity, drag=step.drag, careful=step.is_careful)
+        step = sent(steps, speed)
+    return speed
+
+
+def sent(steps: Generator[Step, float, None], speed: float) -> Step | None:
+    """The step after the one at whose end the cloth had this speed [m/s]; None at a course's end."""
+    try:
+        return steps.send(speed)
+    except StopIteration:
+        return None
+
+
 class Draper:
     """Drapes one garment on one body; keeps the canonical drape of the last shape and style."""
 
@@ -232,39 +293,31 @@ class Draper:
         """The settled canonical drape of a shape and style and its collider, (N, 3) and (V, 3) [m]."""
         key = np.concatenate((betas, style)).astype(np.float32).tobytes()
         if self._canonical is None or self._canonical[0] != key:
-            self._canonical = (key, *self._settle_canonical(betas, style))
+            course = self.canonical_course(betas)
+            cut = self.cut(betas, style)
+            start = self.dressed(betas, style, course)
+            self.begin(cut, start, course.bodies[0])
+            follow(self.cloth, course)
+            self._canonical = (key, self.cloth.positions.copy(), course.bodies[-1])
         return self._canonical[1:]
 
-    def _settle_canonical(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> tuple[F32, F32]:
-        # The garment is put on in the T-pose that it was cut in: if skinning lowered its arms, the armpits would start
-        # out folded into themselves.
-        s = self.settings
-        rest = self.rest(betas, style)
-        body = self.bodies(np.zeros((1, N_JOINTS, 3)), betas)[0]
-        self.begin(rest, betas, style, body)
-        self.cloth.positions[:] = self.outfit.layered(rest, body, self._sdf)
-        gravity = np.array([0, -GRAVITY, 0], np.float32)
-        for _ in range(s.dress_frames):
-            self.cloth.frame(body, body, gravity=gravity, drag=s.drag[0])
-        for after in self.bodies(pose_path(np.zeros((N_JOINTS, 3)), CANONICAL_POSE, s.lower_frames), betas):
-            self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
-            body = after
-        for k in range(s.canonical_frames):
-            speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
-            if k > 8 and speed < s.rest_speed / 2:
-                break
-        return self.cloth.positions.copy(), body
+    def dressed(self, betas: NDArray[np.floating], style: NDArray[np.floating], course: Course) -> F32:
+        """The garment as it is put on, at the start of a canonical course [m], shape (N, 3)."""
+        self.rebuild(course.bodies[0])
+        return self.outfit.layered(self.rest(betas, style), course.bodies[0], self._sdf)
 
-    def begin(self, positions: F32, betas: NDArray[np.floating], style: NDArray[np.floating], body: F32) -> None:
-        """Puts the cloth of a shape and style at `positions` (N, 3), at rest, for the body's vertices (V, 3) [m]."""
-        rest = self.rest(betas, style)
-        shape = _alone(betas)
+    def cut(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> Cut:
+        """The cloth of a shape and style."""
+        rest, shape = self.rest(betas, style), _alone(betas)
         transforms = self.body(self._comfort, shape).transforms
-        posed = self.garment.pose(torch.from_numpy(rest).expand(len(self._comfort), -1, -1), transforms).numpy()
+        *eased, crook = self.garment.pose(torch.from_numpy(rest).expand(len(self._comfort), -1, -1), transforms).numpy()
         body_rest = self.body.rest_vertices(shape)[0].numpy()
         self.rebuild(body_rest)
-        *eased, crook = posed
-        self.cloth.start(rest, positions, eased=eased, crooks=[crook], waist=self._waist, body_rest=body_rest)
+        return self.cloth.cut(rest, eased=eased, crooks=[crook], waist=self._waist, body_rest=body_rest)
+
+    def begin(self, cut: Cut, positions: F32, body: F32) -> None:
+        """Puts cloth of this cut at `positions` (N, 3), at rest, for the body's vertices (V, 3) [m]."""
+        self.cloth.start(cut, positions)
         self.rebuild(body)
 
     def rebuild(self, body: F32) -> None:
@@ -272,37 +325,59 @@ class Draper:
         self._sdf.update(torch.from_numpy(np.ascontiguousarray(body)))
         self._sdf.rebuild()
 
-    def drape(
-        self, pose: NDArray[np.floating], betas: NDArray[np.floating], style: NDArray[np.floating]
-    ) -> SettledDrape:
-        """The garment of `style` (4,) at rest on the body of `betas` (10,) in `pose` (24, 3) [rad].
+    def canonical_course(self, betas: NDArray[np.floating]) -> Course:
+        """From the T-pose to the canonical drape.
+
+        The garment is put on in the T-pose that it was cut in: if skinning lowered its arms, the armpits would start
+        out folded into themselves.
+        """
+        s, start = self.settings, np.zeros((1, N_JOINTS, 3), np.float32)
+        poses = np.concatenate((start, pose_path(start[0], CANONICAL_POSE, s.lower_frames)))
+        # The T-pose is computed alone: in a batch, the last bits of a product depend on the number of rows.
+        bodies = np.concatenate([self.bodies(some, betas) for some in (poses[:1], poses[1:])])
+        gravity = np.broadcast_to(_DOWN, (len(poses), 3))
+        settle, rest = (_FEWEST, s.canonical_frames), s.rest_speed / 2
+        return Course(bodies, gravity, s.drag, dress=s.dress_frames, settle=settle, rest_speed=rest, careful=0)
+
+    def course(self, pose: NDArray[np.floating], betas: NDArray[np.floating], start: F32) -> Course:
+        """From the canonical drape, on the body `start` (V, 3) [m], to the drape in `pose` (24, 3) [rad].
 
         The root's rotation tilts gravity and not the body: a person who bends forward doesn't swing the cloth about.
         """
-        s = self.settings
-        start, body = self.canonical(betas, style)
-        target = np.array(pose, np.float32)
+        s, target = self.settings, np.array(pose, np.float32)
         root = Rotation.from_rotvec(target[0].astype(np.float64))
         target[0] = 0
-        way = np.linalg.norm(self.bodies(target[None], betas)[0] - body, axis=1).max()
+        way = np.linalg.norm(self.bodies(target[None], betas)[0] - start, axis=1).max()
         n = int(np.clip(np.ceil(way / s.speed), *s.move_frames))
-        poses = pose_path(CANONICAL_POSE, target, n)
-        tilts = pose_path(np.zeros((1, 3)), root.as_rotvec()[None], n)
-        bodies = self.bodies(poses, betas)
-        self.begin(start, betas, style, bodies[-1])
-        down = np.array([0, -GRAVITY, 0])
-        for after, tilt in zip(bodies, tilts, strict=True):
-            gravity = Rotation.from_rotvec(tilt[0]).inv().apply(down).astype(np.float32)
-            self.cloth.frame(body, after, gravity=gravity, drag=s.drag[1])
-            body = after
-        fewest, most = (count - s.careful_frames for count in s.settle_frames)
-        for settled in range(1, most + 1):
-            speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2])
-            if speed < s.rest_speed and settled >= fewest:
-                break
-        for _ in range(s.careful_frames):
-            speed = self.cloth.frame(body, body, gravity=gravity, drag=s.drag[2], careful=True)
-        level = self.untangled(self.cloth.positions, body)
+        bodies = np.concatenate((start[None], self.bodies(pose_path(CANONICAL_POSE, target, n), betas)))
+        tilts = Rotation.from_rotvec(pose_path(np.zeros((1, 3)), root.as_rotvec()[None], n)[:, 0]).inv()
+        gravity = np.concatenate((_DOWN[None], tilts.apply(_DOWN)))
+        settle = s.settle_frames[0] - s.careful_frames, s.settle_frames[1] - s.careful_frames
+        return Course(bodies, gravity, s.drag, settle=settle, rest_speed=s.rest_speed, careful=s.careful_frames)
+
+    def drape(
+        self, pose: NDArray[np.floating], betas: NDArray[np.floating], style: NDArray[np.floating]
+    ) -> SettledDrape:
+        """The garment of `style` (4,) at rest on the body of `betas` (10,) in `pose` (24, 3) [rad]."""
+        start, body = self.canonical(betas, style)
+        course, cut = self.course(pose, betas, body), self.cut(betas, style)
+        self.begin(cut, start, course.bodies[-1])
+        speed = follow(self.cloth, course)
+        return self.settled(self.cloth.positions, course.bodies[-1], cut, pose, betas, speed=speed)
+
+    def settled(
+        self,
+        positions: F32,
+        body: F32,
+        cut: Cut,
+        pose: NDArray[np.floating],
+        betas: NDArray[np.floating],
+        *,
+        speed: float,
+    ) -> SettledDrape:
+        """The drape of cloth that has come to rest at `positions` (N, 3) on `body` (V, 3), at the end of a course."""
+        level = self.untangled(positions, body)
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
+        root = Rotation.from_rotvec(np.asarray(pose, np.float32)[0].astype(np.float64))
         turned = np.ascontiguousarray(root.apply(level.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
-        return SettledDrape(turned, speed, self.cloth.stretch(level))
+        return SettledDrape(turned, speed, cut.stretch(self.topology, level))

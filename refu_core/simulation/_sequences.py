@@ -165,7 +165,8 @@ class SequenceSimulator(Simulator):
         """
         s, cloth, poses = self.settings, self._draper.cloth, motion.poses
         bodies = np.concatenate([self._draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
-        self._draper.begin(start, betas, style, bodies[0])
+        cut = self._draper.cut(betas, style)
+        self._draper.begin(cut, start, bodies[0])
         gravity = (np.array([0, -GRAVITY, 0]) - motion.acceleration()).astype(np.float32)
         n = len(poses[::STEPS])
         vertices = np.zeros((n, *start.shape), np.int16)
@@ -192,7 +193,7 @@ class SequenceSimulator(Simulator):
                 stretch[t], speed[t] = cloth.stretch(), now  # a moving cloth may be fast: no limit on its speed
                 if caught == s.most_caught:
                     drape = self._draper.drape(poses[k], betas, style)
-                    self._draper.begin(drape.vertices, betas, style, body)
+                    self._draper.begin(cut, drape.vertices, body)
                     caught, moves_from = 0, t + 1 + _LOOKED_BACK
         return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
 

@@ -174,7 +174,7 @@ def test_cloth_that_got_through_is_brought_back(clips: Path, is_in_body: bool) -
     simulator = SequenceSimulator(plan, split_clips(load_clips(clips)), SequenceSettings(), None)
     still = np.zeros(10, np.float32), np.zeros(4, np.float32)
     positions, body = simulator._draper.canonical(*still)
-    simulator._draper.begin(positions, *still, body)
+    simulator._draper.begin(simulator._draper.cut(*still), positions, body)
     cloth, ring = simulator._draper.cloth, simulator.garment.mesh.ring
     sdf = exact_sdf(simulator.body)
     sdf.update(torch.from_numpy(body))
