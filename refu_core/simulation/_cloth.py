@@ -116,12 +116,12 @@ class ClothSettings:
     """Share of a waistband's distance from its place on the skin that is closed in one sweep."""
 
 
-_REACH = 0.04  # [m]: a vertex's distance to the skin is known up to this
-_NEAR = 0.012  # [m]: vertices closer than this have a contact
-_SLIDE = 0.003  # [m]: a contact's tangent plane is used until the vertex has moved this far
-_PAIR_REACH = 0.007  # [m]: a vertex this close to another part of the cloth gets a self-contact
-_PAIR_SLACK = 0.003  # [m]: pairs are searched this much farther out, and anew when a vertex has moved half of it
-_MAX_SPEED = 6.0  # [m/s]
+REACH = 0.04  # [m]: a vertex's distance to the skin is known up to this
+NEAR = 0.012  # [m]: vertices closer than this have a contact
+SLIDE = 0.003  # [m]: a contact's tangent plane is used until the vertex has moved this far
+PAIR_REACH = 0.007  # [m]: a vertex this close to another part of the cloth gets a self-contact
+PAIR_SLACK = 0.003  # [m]: pairs are searched this much farther out, and anew when a vertex has moved half of it
+MAX_SPEED = 6.0  # [m/s]
 _APART = 10.0  # [m]: separate pieces are taken to be this far apart at rest, so they are never neighbours
 
 
@@ -142,6 +142,16 @@ class Cut:
     """Vertices that are held at the skin, shape (A,)."""
     anchors: tuple[I32, F32, F32]
     """For each of them the face of the body (A,), weights of its corners (A, 3), distance from it [m] (A, 1)."""
+
+    @property
+    def pair_reach(self) -> float:
+        """How near a vertex the centres of faces are that it may touch before it has moved by half of the slack [m]."""
+        return float(np.float32(PAIR_REACH + 0.85 * self.edge_length) + np.float32(PAIR_SLACK))
+
+    @property
+    def rest_apart(self) -> float:
+        """Faces whose centres are nearer than this at rest are the vertex's neighbours and not touched [m]."""
+        return 2.2 * self.edge_length
 
     def stretch(self, topology: ClothTopology, positions: F32) -> float:
         """99.9th percentile of edge length over the length reached freely, of `positions` (N, 3) [m]."""
@@ -178,7 +188,7 @@ class _Skin:
 
     def stale(self, points: F32) -> I32:
         """Which of the points (N, 3) must be queried again: those that have moved too far since their last query."""
-        near, slide = np.float32(_NEAR), np.float32(_SLIDE)
+        near, slide = np.float32(NEAR), np.float32(SLIDE)
         allowed = np.where(self.distance > near + slide, self.distance - near, slide)
         return np.flatnonzero(np.square(points - self.asked_at).sum(1) > allowed * allowed).astype(np.int32)
 
@@ -213,7 +223,7 @@ class SimulatedCloth:
         self.velocities: F32 = np.zeros((n, 3), np.float32)
         self._previous: F32 = np.zeros((n, 3), np.float32)
 
-    def cut(
+    def tailored(
         self, rest: F32, *, eased: Sequence[F32], crooks: Sequence[F32], waist: NDArray[np.intp], body_rest: F32
     ) -> Cut:
         """The cloth of a garment whose rest shape is `rest` (N, 3) [m].
@@ -247,7 +257,7 @@ class SimulatedCloth:
     def start(self, cut: Cut, positions: F32) -> None:
         """Puts cloth of this cut at `positions` (N, 3) [m], at rest."""
         n = len(positions)
-        self._cut = cut
+        self.cut = cut
         self._skin, self._middles = _Skin(n), _Skin(len(self.topology.mesh.edges))
         self._searched_at: F32 = np.full((n, 3), 1e6, np.float32)  # far away: the first call searches
         self.positions[:] = positions
@@ -260,7 +270,7 @@ class SimulatedCloth:
         return length
 
     def _anchor_points(self, body: F32) -> F32:
-        face, weights, offset = self._cut.anchors
+        face, weights, offset = self.cut.anchors
         a, b, c = body[self._body_faces[face]].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
@@ -298,14 +308,14 @@ class SimulatedCloth:
             pairs = self._pairs()
             for _ in range(min(refresh, s.substeps - first)):
                 substep(
-                    self.positions, self.velocities, self._previous, self._cut.inverse_mass,
-                    self._ends, self._cut.shortest, self._cut.longest, self._softness,
+                    self.positions, self.velocities, self._previous, self.cut.inverse_mass,
+                    self._ends, self.cut.shortest, self.cut.longest, self._softness,
                     h, gravity, np.float32(np.exp(-drag * s.substep)),
                     *contacts, np.float32(s.margin), np.float32(s.friction),
-                    self._cut.anchored, anchor, anchor_motion, np.float32(s.anchor_stiffness),
+                    self.cut.anchored, anchor, anchor_motion, np.float32(s.anchor_stiffness),
                     *pairs, np.float32(s.thickness),
                     *edges, np.float32(s.edge_margin),  # type: ignore[arg-type]  # mypy loses count after two unpackings
-                    s.iterations, np.float32(_MAX_SPEED * s.substep),
+                    s.iterations, np.float32(MAX_SPEED * s.substep),
                 )  # fmt: skip
         return float(np.sqrt((self.velocities**2).sum(1).mean()))
 
@@ -313,16 +323,16 @@ class SimulatedCloth:
         """Vertices near a face that they aren't near in the rest shape, the face, and the vertex's side of it."""
         from refu_core.simulation._solver import find_candidates, near_pairs
 
-        faces, reach = self.topology.mesh.faces, np.float32(_PAIR_REACH + 0.85 * self._cut.edge_length)
-        if float(np.sqrt(np.square(self.positions - self._searched_at).sum(1).max())) > _PAIR_SLACK / 2:
-            rest_apart, cell = np.float32(2.2 * self._cut.edge_length), reach + np.float32(_PAIR_SLACK)
-            self._candidates = find_candidates(self.positions, faces, self._cut.told_apart, rest_apart, cell)
+        faces = self.topology.mesh.faces
+        if float(np.sqrt(np.square(self.positions - self._searched_at).sum(1).max())) > PAIR_SLACK / 2:
+            ways = np.float32(self.cut.rest_apart), np.float32(self.cut.pair_reach)
+            self._candidates = find_candidates(self.positions, faces, self.cut.told_apart, *ways)
             self._searched_at[:] = self.positions
-        return near_pairs(self.positions, faces, *self._candidates, np.float32(_PAIR_REACH))
+        return near_pairs(self.positions, faces, *self._candidates, np.float32(PAIR_REACH))
 
     def _edge_contacts(self, body: F32, motion: F32 | None) -> _Contacts:
         edges, skin = self.topology.mesh.edges, self._middles
-        near = self._skin.distance[edges].max(1) < _NEAR
+        near = self._skin.distance[edges].max(1) < NEAR
         middle = self.positions[edges].mean(1)
         stale = skin.stale(middle)
         which, point, direction, moved = self._touch(skin, middle, stale[near[stale]], body, motion)
@@ -337,16 +347,12 @@ class SimulatedCloth:
             asked = points[stale]
             self._sdf.update(torch.from_numpy(body))
             near = torch.from_numpy(skin.face[stale])
-            found = self._sdf.closest(torch.from_numpy(asked), max_distance=_REACH, near=near)
+            found = self._sdf.closest(torch.from_numpy(asked), max_distance=REACH, near=near)
             skin.face[stale] = found.face.numpy()
             skin.weights[stale] = found.barycentrics.numpy()
             skin.asked_at[stale] = asked
-            skin.distance[stale] = np.minimum(found.distance.numpy(), _REACH) * found.sign.numpy()
+            skin.distance[stale] = np.minimum(found.distance.numpy(), REACH) * found.sign.numpy()
         return refresh_points(
             points, skin.face, skin.weights, skin.distance, skin.normal, stale,
-            self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(_NEAR),
+            self._body_faces, body, body if motion is None else motion, motion is not None, np.float32(NEAR),
         )  # fmt: skip
-
-    def stretch(self, positions: F32 | None = None) -> float:
-        """As `Cut.stretch`, of the cloth where it is, or of `positions` (N, 3) [m]."""
-        return self._cut.stretch(self.topology, self.positions if positions is None else positions)

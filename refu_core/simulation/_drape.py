@@ -177,6 +177,8 @@ class SettledDrape:
     """Root mean square speed that is left [m/s]."""
     stretch: float
     """99.9th percentile of edge length over the length that the edge reaches freely."""
+    cut: Cut
+    """Its cloth."""
 
 
 _DOWN = np.array([0, -GRAVITY, 0])
@@ -262,7 +264,7 @@ class Draper:
         counts = [garment.n_vertices for garment in self.outfit.garments]
         piece = np.repeat(np.arange(len(counts)), counts)
         self.cloth = SimulatedCloth(self.topology, sdf, piece=piece, settings=self.settings.cloth)
-        self._waist = self._waists()
+        self.waist = self._waists()
         self.untangled = Untangle(garment.mesh, sdf, margin=self.settings.cloth.margin)
         self._comfort = np.concatenate((COMFORT_POSES, CROOK_POSE[None]))
         self._canonical: tuple[bytes, F32, F32] | None = None
@@ -313,7 +315,7 @@ class Draper:
         *eased, crook = self.garment.pose(torch.from_numpy(rest).expand(len(self._comfort), -1, -1), transforms).numpy()
         body_rest = self.body.rest_vertices(shape)[0].numpy()
         self.rebuild(body_rest)
-        return self.cloth.cut(rest, eased=eased, crooks=[crook], waist=self._waist, body_rest=body_rest)
+        return self.cloth.tailored(rest, eased=eased, crooks=[crook], waist=self.waist, body_rest=body_rest)
 
     def begin(self, cut: Cut, positions: F32, body: F32) -> None:
         """Puts cloth of this cut at `positions` (N, 3), at rest, for the body's vertices (V, 3) [m]."""
@@ -380,4 +382,4 @@ class Draper:
         pelvis = self.body.rest_joints(_alone(betas))[0, 0].numpy()
         root = Rotation.from_rotvec(np.asarray(pose, np.float32)[0].astype(np.float64))
         turned = np.ascontiguousarray(root.apply(level.astype(np.float64) - pelvis) + pelvis, dtype=np.float32)
-        return SettledDrape(turned, speed, cut.stretch(self.topology, level))
+        return SettledDrape(turned, speed, cut.stretch(self.topology, level), cut)

@@ -145,9 +145,9 @@ class SequenceSimulator(Simulator):
         row: dict[str, Any] = {"slot": slot, "shape": slot % plan.shapes, "split": split, "betas": betas}
         for attempt in range(self.settings.attempts):
             motion = plan.motion(slot, self.clips[split == TEST], attempt)
-            drape = self._draper.drape(motion.poses[0], betas, style)
-            body = self._draper.bodies(motion.poses[:1], betas)[0]
-            if self._examine(drape.vertices, body, stretch=drape.stretch)[0] is None:
+            drape = self.draper.drape(motion.poses[0], betas, style)
+            body = self.draper.bodies(motion.poses[:1], betas)[0]
+            if self._examine(drape.vertices, body, drape.cut)[0] is None:
                 break  # an arm that begins within the cloth would stay there
         played = self._play(motion, drape.vertices, betas, style)
         row |= {"style": style, **played, "pose": motion.poses[::STEPS], "transl": motion.transl[::STEPS]}
@@ -163,10 +163,10 @@ class SequenceSimulator(Simulator):
         `start` (N, 3) [m]. Cloth that stays caught is draped anew, and its frames aren't taken until it moves as if it
         had been there all along.
         """
-        s, cloth, poses = self.settings, self._draper.cloth, motion.poses
-        bodies = np.concatenate([self._draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
-        cut = self._draper.cut(betas, style)
-        self._draper.begin(cut, start, bodies[0])
+        s, cloth, poses = self.settings, self.draper.cloth, motion.poses
+        bodies = np.concatenate([self.draper.bodies(poses[k : k + 50], betas) for k in range(0, len(poses), 50)])
+        cut = self.draper.cut(betas, style)
+        self.draper.begin(cut, start, bodies[0])
         gravity = (np.array([0, -GRAVITY, 0]) - motion.acceleration()).astype(np.float32)
         n = len(poses[::STEPS])
         vertices = np.zeros((n, *start.shape), np.int16)
@@ -177,7 +177,7 @@ class SequenceSimulator(Simulator):
             now = 0.0
             if k:
                 if k % s.rebuild_every == 0:
-                    self._draper.rebuild(bodies[k - 1])
+                    self.draper.rebuild(bodies[k - 1])
                 careful = k % STEPS == 0  # where a frame is stored; elsewhere it would only take time
                 now = cloth.frame(bodies[k - 1], body, gravity=gravity[k], drag=s.drag, careful=careful)
             if is_lost(cloth.positions):
@@ -190,10 +190,13 @@ class SequenceSimulator(Simulator):
                 caught = caught + 1 if found in GOT_THROUGH else 0
                 found = "unsettled" if found is None and t < moves_from else found
                 vertices[t], cause[t] = stored, 0 if found is None else 1 + CAUSES.index(found)
-                stretch[t], speed[t] = cloth.stretch(), now  # a moving cloth may be fast: no limit on its speed
+                stretch[t], speed[t] = (
+                    cut.stretch(self.draper.topology, cloth.positions),
+                    now,
+                )  # a moving cloth may be fast: no limit on its speed
                 if caught == s.most_caught:
-                    drape = self._draper.drape(poses[k], betas, style)
-                    self._draper.begin(cut, drape.vertices, body)
+                    drape = self.draper.drape(poses[k], betas, style)
+                    self.draper.begin(cut, drape.vertices, body)
                     caught, moves_from = 0, t + 1 + _LOOKED_BACK
         return {"vertices": vertices, "cause": cause, "stretch": stretch, "speed": speed}
 
@@ -204,17 +207,17 @@ class SequenceSimulator(Simulator):
         side that it is on. So it is smoothed where it intersects itself. While that doesn't free it, the body waits and
         the cloth is strongly damped. `gravity` is (3,) [m/s²].
         """
-        cloth, s = self._draper.cloth, self.settings
+        cloth, s = self.draper.cloth, self.settings
         for pause in range(s.pauses + 1):
             if pause:
                 cloth.frame(body, body, gravity=gravity, drag=s.drape.drag[0], careful=True)
                 if is_lost(cloth.positions):
                     return "unsettled", None
-            level = self._draper.untangled(cloth.positions, body)
-            found, stored = self._examine(level, body, stretch=cloth.stretch(level))
+            level = self.draper.untangled(cloth.positions, body)
+            found, stored = self._examine(level, body, cloth.cut)
             if found not in GOT_THROUGH:
                 if np.linalg.norm(level - cloth.positions, axis=1).max() > s.most_smoothing:
-                    found, stored = self._examine(cloth.positions, body, stretch=cloth.stretch())
+                    found, stored = self._examine(cloth.positions, body, cloth.cut)
                 cloth.positions[:] = level
                 break
         return found, stored

@@ -13,8 +13,8 @@ import numpy as np
 from refu_core.body import load_body, load_fit
 from refu_core.garments import load_garment, worn_on
 from refu_core.metrics import CollisionChecker, SheetChecker
-from refu_core.simulation._cloth import F32
-from refu_core.simulation._drape import Draper, DrapeSettings
+from refu_core.simulation._cloth import F32, Cut
+from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import TEST, SamplePlan, garments_of
 from refu_core.simulation._poses import Clip
@@ -95,7 +95,7 @@ class Simulator(ABC):
         outfit = JoinedGarments([worn_on(load_garment(garment), own) for garment in garments_of(plan.garment)])
         self.garment, self.parts = outfit.joined, outfit.parts
         self.body = load_body(self.garment.body) if own is None else own.body
-        self._draper = Draper(outfit, self.body, settings=settings.drape)
+        self.draper = Draper(outfit, self.body, settings=settings.drape)
         self._selector = Selector(self.body.faces, self.garment.faces, settings=settings.selection)
 
     @property
@@ -111,13 +111,13 @@ class Simulator(ABC):
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
 
-    def _examine(self, vertices: F32, body: F32, *, stretch: float, speed: float = 0.0) -> tuple[str | None, Any]:
+    def _examine(self, vertices: F32, body: F32, cut: Cut, *, speed: float = 0.0) -> tuple[str | None, Any]:
         """Why cloth is rejected, if it is, and the cloth as stored: None where it isn't finite or is too far off."""
         if is_lost(vertices):
             return "unsettled", None
         stored = quantise(vertices)
         read = dequantise(stored)  # What is checked is what will be read, rounding included.
-        stretch = max(stretch, self._draper.cloth.stretch(read))
+        stretch = max(cut.stretch(self.draper.topology, one) for one in (vertices, read))
         return self._selector.cause(read, body, stretch=stretch, speed=speed), stored
 
 
@@ -127,23 +127,35 @@ class SlotSimulator(Simulator):
     kind = FORMAT
     plan: SamplePlan
 
+    def tried(self, slot: int, attempt: int) -> tuple[F32, int, int]:
+        """The pose (24, 3) [rad] of a slot's attempt, and its clip and frame, as `SamplePlan.pose`."""
+        return self.plan.pose(slot, attempt, self.clips[self.plan.split_of(slot) == TEST])
+
+    def judged(self, drape: SettledDrape, pose: F32, betas: F32) -> tuple[str | None, dict[str, Any]]:
+        """Why a drape in this pose (24, 3) and shape (10,) is rejected, if it is, and its columns (see `_store`)."""
+        body = self.draper.bodies(pose[None], betas)[0]
+        cause, stored = self._examine(drape.vertices, body, drape.cut, speed=drape.speed)
+        return cause, {"vertices": stored, "stretch": drape.stretch, "speed": drape.speed, "state": DONE}
+
+    def begun(self, slot: int) -> dict[str, Any]:
+        """The columns of a slot's row that its drape doesn't change."""
+        plan, pair = self.plan, self.plan.pair_of(slot)
+        betas, style = plan.style_shape(pair)
+        return {"slot": slot, "pair": pair, "split": plan.split_of(slot), "betas": betas, "style": style}
+
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
-        start, plan = time.perf_counter(), self.plan
-        split, pair = plan.split_of(slot), plan.pair_of(slot)
-        betas, style = plan.style_shape(pair)
+        start, row = time.perf_counter(), self.begun(slot)
+        betas, style = row["betas"], row["style"]
         dropped = np.zeros(len(CAUSES), np.uint8)
-        row: dict[str, Any] = {"slot": slot, "pair": pair, "split": split, "betas": betas, "style": style}
         for attempt in range(self.settings.attempts):
-            pose, clip, frame = plan.pose(slot, attempt, self.clips[split == TEST])
-            drape = self._draper.drape(pose, betas, style)
-            body = self._draper.bodies(pose[None], betas)[0]
-            cause, stored = self._examine(drape.vertices, body, stretch=drape.stretch, speed=drape.speed)
+            pose, clip, frame = self.tried(slot, attempt)
+            drape = self.draper.drape(pose, betas, style)
+            cause, taken = self.judged(drape, pose, betas)
             if cause is not None:
                 dropped[CAUSES.index(cause)] += 1
                 continue
-            row |= {"vertices": stored, "pose": pose, "clip": clip, "frame": frame}
-            row |= {"stretch": drape.stretch, "speed": drape.speed, "state": DONE}
+            row |= taken | {"pose": pose, "clip": clip, "frame": frame}
             break
         else:
             row["state"] = GIVEN_UP

@@ -173,9 +173,9 @@ def test_cloth_that_got_through_is_brought_back(clips: Path, is_in_body: bool) -
     plan = SequencePlan(GARMENT, 2, shapes=1, seconds=SECONDS)
     simulator = SequenceSimulator(plan, split_clips(load_clips(clips)), SequenceSettings(), None)
     still = np.zeros(10, np.float32), np.zeros(4, np.float32)
-    positions, body = simulator._draper.canonical(*still)
-    simulator._draper.begin(simulator._draper.cut(*still), positions, body)
-    cloth, ring = simulator._draper.cloth, simulator.garment.mesh.ring
+    positions, body = simulator.draper.canonical(*still)
+    simulator.draper.begin(simulator.draper.cut(*still), positions, body)
+    cloth, ring = simulator.draper.cloth, simulator.garment.mesh.ring
     sdf = exact_sdf(simulator.body)
     sdf.update(torch.from_numpy(body))
     near = sdf.query(torch.from_numpy(positions))
@@ -217,7 +217,7 @@ def test_caught_cloth_is_draped_anew(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (cause[settling] == 1 + CAUSES.index("unsettled")).all()
     assert (cause[settling.stop :] == 0).all()
     # Caught cloth goes on from the drape of its body's pose.
-    drape = simulator._draper.drape(row["pose"][most - 1], row["betas"], row["style"])
+    drape = simulator.draper.drape(row["pose"][most - 1], row["betas"], row["style"])
     after, before = (dequantise(row["vertices"][t]) for t in (most, most - 1))
     assert np.abs(after - drape.vertices).mean() < np.abs(after - before).mean()
 
