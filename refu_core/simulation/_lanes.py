@@ -80,7 +80,7 @@ class ClothLanes:
         self._stream = (
             contextlib.nullcontext() if device.type == "cpu" else torch.cuda.stream(torch.cuda.Stream(device))
         )
-        if is_cuda:
+        if device.type == "cuda":
             torch.cuda.synchronize(device)  # from here on all is done on the one stream
         with self._stream, torch_stream(device):
             triangles = np.asarray(body_faces, np.int32) + n_body * np.arange(lanes, dtype=np.int32)[:, None, None]
