@@ -7,6 +7,7 @@ Bodies, cuts and checks of a sample are those of `SlotSimulator`, in processes o
 from __future__ import annotations
 
 import os
+import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +15,8 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -51,10 +54,10 @@ _simulator: SlotSimulator
 """A helping process's own."""
 
 
-def _begin(make: Callable[[], Any]) -> None:
+def _begin(make: Path) -> None:
     global _simulator
     torch.set_num_threads(1)
-    _simulator = make()
+    _simulator = pickle.loads(make.read_bytes())()
 
 
 def _prepare(attempts: list[_Attempt], is_first: bool) -> _Prepared:
@@ -127,13 +130,22 @@ class LaneEngine:
         if not isinstance(simulator, SlotSimulator):
             raise SimulationError(f"a GPU simulates garments at rest, got {type(simulator).__name__}: take the cpu")
         spawning = get_context("spawn")  # a fork of a process that has a GPU can't use torch
-        with ProcessPoolExecutor(self._jobs, spawning, _begin, (make,)) as pool:
-            try:
-                yield from _Run(simulator, pool, tasks, self._lanes, self._device).blocks()
-            except BrokenProcessPool as error:
-                raise SimulationError("a helping process was killed (out of memory?): run the same again") from error
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
+        with TemporaryDirectory() as folder:
+            # In a file: what doesn't fit into a pipe would keep each process from being started beside the last.
+            sent = Path(folder) / "make.pickle"
+            sent.write_bytes(pickle.dumps(make))
+            with ProcessPoolExecutor(self._jobs, spawning, _begin, (sent,)) as pool:
+                yield from self._blocks(simulator, pool, tasks)
+
+    def _blocks(
+        self, simulator: SlotSimulator, pool: ProcessPoolExecutor, tasks: Sequence[list[int]]
+    ) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+        try:
+            yield from _Run(simulator, pool, tasks, self._lanes, self._device).blocks()
+        except BrokenProcessPool as error:
+            raise SimulationError("a helping process was killed (out of memory?): run the same again") from error
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 class _Run:
