@@ -10,6 +10,7 @@ from refu_core.simulation._dataset import open_dataset as open_dataset
 from refu_core.simulation._drape import Draper as Draper
 from refu_core.simulation._drape import DrapeSettings as DrapeSettings
 from refu_core.simulation._drape import colliders as colliders
+from refu_core.simulation._lane_engine import LaneEngine as LaneEngine
 from refu_core.simulation._plan import SamplePlan as SamplePlan
 from refu_core.simulation._plan import names_of as names_of
 from refu_core.simulation._poses import POSTURES as POSTURES

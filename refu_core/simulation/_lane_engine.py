@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -23,11 +24,10 @@ import numpy as np
 import torch
 
 from refu_core._device import checked_device
-from refu_core._engine import Lost
 from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.simulation._cloth import F32, Cut, Step
-from refu_core.simulation._drape import Course, DrapeSettings, sent
+from refu_core.simulation._drape import CANONICAL_POSE, Course, DrapeSettings, sent
 from refu_core.simulation._lanes import ClothLanes
 from refu_core.simulation._store import CAUSES, GIVEN_UP
 from refu_core.simulation._worker import SlotSimulator
@@ -56,6 +56,7 @@ _simulator: SlotSimulator
 
 def _begin(make: Path) -> None:
     global _simulator
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the command, which ends its helpers
     torch.set_num_threads(1)
     _simulator = pickle.loads(make.read_bytes())()
 
@@ -63,10 +64,14 @@ def _begin(make: Path) -> None:
 def _prepare(attempts: list[_Attempt], is_first: bool) -> _Prepared:
     draper, plan = _simulator.draper, _simulator.plan
     betas, style = plan.style_shape(plan.pair_of(attempts[0][0]))
-    canonical = draper.canonical_course(betas)
-    start = draper.dressed(betas, style, canonical) if is_first else None
-    courses = [draper.course(_simulator.tried(*attempt)[0], betas, canonical.bodies[-1]) for attempt in attempts]
-    return _Prepared(draper.cut(betas, style), courses, start, canonical if is_first else None)
+    canonical = draper.canonical_course(betas) if is_first else None
+    body = draper.bodies(CANONICAL_POSE[None], betas)[0]
+    return _Prepared(
+        draper.cut(betas, style),
+        [draper.course(_simulator.tried(*attempt)[0], betas, body) for attempt in attempts],
+        None if canonical is None else draper.dressed(betas, style, canonical),
+        canonical,
+    )
 
 
 def _judge(attempt: _Attempt, cut: Cut, positions: F32, speed: float) -> tuple[str | None, dict[str, Any]]:
@@ -119,9 +124,7 @@ class LaneEngine:
         self._device, self._lanes = checked_device(device), lanes
         self._jobs = jobs or max((os.cpu_count() or 2) - 1, 1)
 
-    def run(
-        self, make: Callable[[], Callable[[list[int]], list[dict[str, Any]]]], tasks: Sequence[list[int]]
-    ) -> Iterator[tuple[int, list[dict[str, Any]] | Lost]]:
+    def run(self, make: Callable[[], Callable[[Any], Any]], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         """Yields each block's number and rows. `make` must make a `SlotSimulator`.
 
         Raises `SimulationError` when a helping process is killed, or `make` makes something else.

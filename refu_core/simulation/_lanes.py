@@ -22,6 +22,7 @@ from torch import Tensor
 from refu_core._warp import Recorded, as_warp, ints, memory, torch_stream
 from refu_core.errors import SimulationError
 from refu_core.simulation import _cloth as cloth
+from refu_core.simulation import _lane_contact_kernels as near_kernels
 from refu_core.simulation import _lane_kernels as kernels
 from refu_core.simulation._cloth import F32, I32, ClothSettings, ClothTopology, Cut, Step
 
@@ -112,13 +113,13 @@ class ClothLanes:
         mass, shortest, longest = (as_warp(one, wp.float32) for one in (self._mass, self._shortest, self._longest))
         flag = {name: as_warp(values, wp.int32) for name, values in self._of_lane.items()}
         origin, course = as_warp(self._origin, vec3), as_warp(self._course, vec3)
-        skin = kernels.Skin()
+        skin = near_kernels.Skin()
         skin.mesh, skin.faces, skin.origin = self._mesh.id, ints(body_faces, device), origin
         skin.vertices, skin.motion = (as_warp(self._new(*self._placed.shape), vec3) for _ in range(2))
         skin.reach, skin.near, skin.slide = cloth.REACH, cloth.NEAR, cloth.SLIDE
         asked, contacts = [], []
         for known in self._asked:
-            one, touching = kernels.Asked(), kernels.Contacts()
+            one, touching = near_kernels.Asked(), near_kernels.Contacts()
             for name, values in known.items():
                 setattr(one, name, as_warp(values, wp.int32 if name == "face" else _KIND[values.ndim]))
             for name in ("point", "normal", "motion"):
@@ -145,21 +146,21 @@ class ClothLanes:
         each, every_face = (n, lanes), (lanes, len(topology.mesh.faces))
         goes = course, flag["before"], flag["after"]
         place = (*goes, 0.0, step, origin, skin.vertices, skin.motion, as_warp(self._placed, vec3))
-        self._place = launch(kernels.place_kernel, self._placed.shape[:2], *place)
+        self._place = launch(near_kernels.place_kernel, self._placed.shape[:2], *place)
         anchor = (*goes, step, skin.faces, *held_at, point, motion)
-        self._anchor = [launch(kernels.anchor_kernel, (len(anchored), lanes), *anchor)] if len(anchored) else []
+        self._anchor = [launch(near_kernels.anchor_kernel, (len(anchored), lanes), *anchor)] if len(anchored) else []
         whom = flag["refreshed"], flag["moved_on"]
-        self._touch = launch(kernels.touch_kernel, each, x, *whom, skin, asked[0], contacts[0])
+        self._touch = launch(near_kernels.touch_kernel, each, x, *whom, skin, asked[0], contacts[0])
         middles = x, edges, flag["careful"], skin, asked[0], asked[1], contacts[1]
-        self._touch_edges = launch(kernels.touch_edges_kernel, (len(topology.edges), lanes), *middles)
+        self._touch_edges = launch(near_kernels.touch_edges_kernel, (len(topology.edges), lanes), *middles)
         since = x, searched, flag["refreshed"], cloth.PAIR_SLACK / 2, flag["wandered"]
-        self._wandered = launch(kernels.wandered_kernel, each, *since)
-        self._centres = launch(kernels.centre_kernel, every_face, x, faces, origin, centre)
+        self._wandered = launch(near_kernels.wandered_kernel, each, *since)
+        self._centres = launch(near_kernels.centre_kernel, every_face, x, faces, origin, centre)
         found = flag["wandered"], count, near, searched
         search = (x, rest, faces, centre, origin, self._grid.id, cell, apart, *found)
-        self._search = launch(kernels.search_kernel, (lanes, n), *search)
+        self._search = launch(near_kernels.search_kernel, (lanes, n), *search)
         sides = x, faces, count, near, flag["refreshed"], cloth.PAIR_REACH, side
-        self._sides = launch(kernels.side_kernel, each, *sides)
+        self._sides = launch(near_kernels.side_kernel, each, *sides)
         self._sum = launch(kernels.speed_kernel, (_SUMS, lanes), v, as_warp(self._total, wp.float32))
 
         gravity, damping = as_warp(self._gravity, vec3), as_warp(self._damping, wp.float32)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from refu_core.options import setting
 from refu_core.recordings import Axes
 from refu_lab.commands import _common as cli
+
+if TYPE_CHECKING:
+    from refu_core._engine import Engine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,13 +72,13 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--output", type=cli.out_folder, required=True, metavar="DIR", help="folder of the data set")
     cli.add_options(parser, SimulateOptions)
+    parser.add_argument("--device", type=cli.word, metavar="cuda", help="simulate many samples at a time on a GPU")
     cli.add_cluster(parser)
     cli.add_common(parser, run)
 
 
 def run(args: argparse.Namespace) -> int:
     from refu_core import RefuError
-    from refu_lab.fleet import open_engine
     from refu_lab.simulate import simulate, simulation_table
 
     if args.sequences and args.postures:
@@ -83,9 +87,23 @@ def run(args: argparse.Namespace) -> int:
         args,
         dict.fromkeys(("shapes", "seconds", "synthetic"), "sequences") | {"input_axes": "motions", "fps": "motions"},
     )
+    if args.device and args.sequences:
+        raise RefuError("a GPU simulates poses at rest alone: leave --device or --sequences out")
+    if args.device and args.scheduler:
+        raise RefuError("a GPU is this machine's: leave --device or --scheduler out")
     if find_spec("numba") is None:  # said before the work begins, which imports it
         raise ModuleNotFoundError(name="numba")
-    with open_engine(args.jobs, args.scheduler) as engine:
+    with _engine_of(args) as engine:
         options = SimulateOptions(**cli.given(args, SimulateOptions))
         card = simulate(options, engine=engine, progress=not args.quiet)
     return cli.tell(args, simulation_table(card, args.output), card)
+
+
+def _engine_of(args: argparse.Namespace) -> AbstractContextManager[Engine]:
+    from refu_core._device import checked_device
+    from refu_core.simulation import LaneEngine
+    from refu_lab.fleet import open_engine
+
+    if args.device and checked_device(args.device).type == "cuda":
+        return nullcontext(LaneEngine(args.device, jobs=args.jobs))
+    return open_engine(args.jobs, args.scheduler)
