@@ -126,7 +126,7 @@ _APART = 10.0  # [m]: separate pieces are taken to be this far apart at rest, so
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class ClothCut:
     """A garment as cloth: what one shape and style of it has, in any pose, for C distance constraints."""
 
     told_apart: F32
@@ -161,7 +161,7 @@ class Cut:
 
 
 @dataclass(frozen=True)
-class Step:
+class CourseStep:
     """One frame of simulated time."""
 
     before: int
@@ -225,7 +225,7 @@ class SimulatedCloth:
 
     def tailored(
         self, rest: F32, *, eased: Sequence[F32], crooks: Sequence[F32], waist: NDArray[np.intp], body_rest: F32
-    ) -> Cut:
+    ) -> ClothCut:
         """The cloth of a garment whose rest shape is `rest` (N, 3) [m].
 
         Where an edge is longer in one of the shapes `eased`, (N, 3) each, it may lengthen freely to that length, within
@@ -244,7 +244,7 @@ class SimulatedCloth:
         self._sdf.update(torch.from_numpy(body_rest))
         found = self._sdf.closest(torch.from_numpy(rest[waist]))
         offset = np.maximum(found.distance.numpy() * found.sign.numpy(), self.settings.margin + 0.002)
-        return Cut(
+        return ClothCut(
             told_apart=rest + np.float32(_APART) * self._piece[:, None].astype(np.float32),
             shortest=np.maximum(shortest, length * np.float32(1 - self.settings.most_crease)),
             longest=np.minimum(longest, length * np.float32(1 + self.settings.most_ease)),
@@ -254,7 +254,7 @@ class SimulatedCloth:
             anchors=(found.face.numpy(), found.barycentrics.numpy(), offset[:, None].astype(np.float32)),
         )
 
-    def start(self, cut: Cut, positions: F32) -> None:
+    def start(self, cut: ClothCut, positions: F32) -> None:
         """Puts cloth of this cut at `positions` (N, 3) [m], at rest."""
         n = len(positions)
         self.cut = cut

@@ -25,7 +25,7 @@ from refu_core.mesh import Connectivity
 from refu_core.metrics import SheetChecker
 from refu_core.realtime import RootTurn
 from refu_core.sdf import ExactSdf
-from refu_core.simulation._cloth import F32, ClothSettings, ClothTopology, Cut, SimulatedCloth, Step
+from refu_core.simulation._cloth import F32, ClothCut, ClothSettings, ClothTopology, CourseStep, SimulatedCloth
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.skeleton import posed
 
@@ -177,7 +177,7 @@ class SettledDrape:
     """Root mean square speed that is left [m/s]."""
     stretch: float
     """99.9th percentile of edge length over the length that the edge reaches freely."""
-    cut: Cut
+    cut: ClothCut
     """Its cloth."""
 
 
@@ -205,21 +205,21 @@ class Course:
     dress: int = 0
     """Frames before the move in which the template becomes cloth."""
 
-    def steps(self) -> Generator[Step, float, None]:
+    def steps(self) -> Generator[CourseStep, float, None]:
         """The frames, one by one; the speed that the cloth has after each is to be sent [m/s]."""
         gravity, last = self.gravity.astype(np.float32), len(self.bodies) - 1
         dressing, moving, settling = self.drag
         for _ in range(self.dress):
-            yield Step(0, 0, gravity[0], dressing)
+            yield CourseStep(0, 0, gravity[0], dressing)
         for k in range(last):
-            yield Step(k, k + 1, gravity[k + 1], moving)
+            yield CourseStep(k, k + 1, gravity[k + 1], moving)
         fewest, most = self.settle
         for settled in range(1, most + 1):
-            speed = yield Step(last, last, gravity[-1], settling)
+            speed = yield CourseStep(last, last, gravity[-1], settling)
             if speed < self.rest_speed and settled >= fewest:
                 break
         for _ in range(self.careful):
-            yield Step(last, last, gravity[-1], settling, is_careful=True)
+            yield CourseStep(last, last, gravity[-1], settling, is_careful=True)
 
 
 def follow(cloth: SimulatedCloth, course: Course) -> float:
@@ -233,7 +233,7 @@ def follow(cloth: SimulatedCloth, course: Course) -> float:
     return speed
 
 
-def sent(steps: Generator[Step, float, None], speed: float) -> Step | None:
+def sent(steps: Generator[CourseStep, float, None], speed: float) -> CourseStep | None:
     """The step after the one at whose end the cloth had this speed [m/s]; None at a course's end."""
     try:
         return steps.send(speed)
@@ -308,7 +308,7 @@ class Draper:
         self.rebuild(course.bodies[0])
         return self.outfit.layered(self.rest(betas, style), course.bodies[0], self._sdf)
 
-    def cut(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> Cut:
+    def cut(self, betas: NDArray[np.floating], style: NDArray[np.floating]) -> ClothCut:
         """The cloth of a shape and style."""
         rest, shape = self.rest(betas, style), _alone(betas)
         transforms = self.body(self._comfort, shape).transforms
@@ -317,7 +317,7 @@ class Draper:
         self.rebuild(body_rest)
         return self.cloth.tailored(rest, eased=eased, crooks=[crook], waist=self.waist, body_rest=body_rest)
 
-    def begin(self, cut: Cut, positions: F32, body: F32) -> None:
+    def begin(self, cut: ClothCut, positions: F32, body: F32) -> None:
         """Puts cloth of this cut at `positions` (N, 3), at rest, for the body's vertices (V, 3) [m]."""
         self.cloth.start(cut, positions)
         self.rebuild(body)
@@ -371,7 +371,7 @@ class Draper:
         self,
         positions: F32,
         body: F32,
-        cut: Cut,
+        cut: ClothCut,
         pose: NDArray[np.floating],
         betas: NDArray[np.floating],
         *,

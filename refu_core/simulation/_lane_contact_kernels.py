@@ -30,7 +30,7 @@ class Contacts:
 
 
 @wp.struct
-class Skin:
+class LaneSkin:
     """The bodies of all lanes, (B, V), at the present time step, and their motion in a step."""
 
     mesh: wp.uint64
@@ -109,7 +109,7 @@ def anchor_kernel(
 
 
 @wp.func
-def ask(p: wp.vec3, is_all: bool, i: int, b: int, skin: Skin, asked: Asked) -> int:
+def ask(p: wp.vec3, is_all: bool, i: int, b: int, skin: LaneSkin, asked: Asked) -> int:
     """Asks for the skin below point i of lane b, if it has moved too far since it last asked; 0."""
     known = asked.distance[i, b]
     allowed = wp.where(known > skin.near + skin.slide, known - skin.near, skin.slide)
@@ -139,7 +139,7 @@ def ask(p: wp.vec3, is_all: bool, i: int, b: int, skin: Skin, asked: Asked) -> i
 
 
 @wp.func
-def meet(i: int, b: int, skin: Skin, asked: Asked, contacts: Contacts) -> int:
+def meet(i: int, b: int, skin: LaneSkin, asked: Asked, contacts: Contacts) -> int:
     """The contact of point i of lane b, if the skin is near; 0."""
     f = asked.face[i, b]
     if f < 0 or asked.distance[i, b] >= 2.0 * skin.near:
@@ -158,7 +158,7 @@ def touch_kernel(
     x: wp.array2d[wp.vec3],
     refreshed: wp.array[wp.int32],
     moved_on: wp.array[wp.int32],
-    skin: Skin,
+    skin: LaneSkin,
     # in and out
     asked: Asked,
     contacts: Contacts,
@@ -176,7 +176,7 @@ def touch_edges_kernel(
     x: wp.array2d[wp.vec3],
     edges: wp.array2d[wp.int32],
     careful: wp.array[wp.int32],
-    skin: Skin,
+    skin: LaneSkin,
     below: Asked,
     # in and out
     asked: Asked,

@@ -26,7 +26,7 @@ import torch
 from refu_core._device import checked_device
 from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
-from refu_core.simulation._cloth import F32, Cut, Step
+from refu_core.simulation._cloth import F32, ClothCut, CourseStep
 from refu_core.simulation._drape import CANONICAL_POSE, Course, DrapeSettings, sent
 from refu_core.simulation._lanes import ClothLanes
 from refu_core.simulation._store import CAUSES, GIVEN_UP
@@ -37,10 +37,10 @@ _Attempt = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class _Prepared:
+class _Courses:
     """What the attempts at slots of one pair need before they are simulated."""
 
-    cut: Cut
+    cut: ClothCut
     courses: list[Course]
     start: F32 | None = None
     """For the first attempts, the garment as it is put on, and the way to the canonical drape."""
@@ -61,12 +61,12 @@ def _begin(make: Path) -> None:
     _simulator = pickle.loads(make.read_bytes())()
 
 
-def _prepare(attempts: list[_Attempt], is_first: bool) -> _Prepared:
+def _prepare(attempts: list[_Attempt], is_first: bool) -> _Courses:
     draper, plan = _simulator.draper, _simulator.plan
     betas, style = plan.style_shape(plan.pair_of(attempts[0][0]))
     canonical = draper.canonical_course(betas) if is_first else None
     body = draper.bodies(CANONICAL_POSE[None], betas)[0]
-    return _Prepared(
+    return _Courses(
         draper.cut(betas, style),
         [draper.course(_simulator.tried(*attempt)[0], betas, body) for attempt in attempts],
         None if canonical is None else draper.dressed(betas, style, canonical),
@@ -74,7 +74,7 @@ def _prepare(attempts: list[_Attempt], is_first: bool) -> _Prepared:
     )
 
 
-def _judge(attempt: _Attempt, cut: Cut, positions: F32, speed: float) -> tuple[str | None, dict[str, Any]]:
+def _judge(attempt: _Attempt, cut: ClothCut, positions: F32, speed: float) -> tuple[str | None, dict[str, Any]]:
     row, (pose, clip, frame) = _simulator.begun(attempt[0]), _simulator.tried(*attempt)
     upright = pose.copy()
     upright[0] = 0
@@ -92,7 +92,7 @@ class _Block:
     slots: list[int]
     drape: F32 | None = None
     """The canonical drape, once it has settled."""
-    waiting: list[tuple[Cut, Course, _Attempt]] = field(default_factory=list)
+    waiting: list[tuple[ClothCut, Course, _Attempt]] = field(default_factory=list)
     """What waits for it."""
     rows: dict[int, dict[str, Any]] = field(default_factory=dict)
     dropped: dict[int, Any] = field(default_factory=dict)
@@ -103,14 +103,14 @@ class _Job:
     """A course of a block's cloth: to its canonical drape, or an attempt at a slot."""
 
     block: _Block
-    cut: Cut
+    cut: ClothCut
     course: Course
     attempt: _Attempt | None
     speed: float = np.inf
 
     def __post_init__(self) -> None:
         self.steps = self.course.steps()
-        self.step: Step | None = next(self.steps)
+        self.step: CourseStep | None = next(self.steps)
 
 
 class LaneEngine:
@@ -204,7 +204,7 @@ class _Run:
             self._ask_for(block, [(slot, 0) for slot in block.slots], is_first=True)
 
     def _ask_for(self, block: _Block, attempts: list[_Attempt], *, is_first: bool = False) -> None:
-        def take(prepared: _Prepared) -> None:
+        def take(prepared: _Courses) -> None:
             block.waiting += [(prepared.cut, *one) for one in zip(prepared.courses, attempts, strict=True)]
             if prepared.canonical is not None and prepared.start is not None:
                 block.drape = prepared.start

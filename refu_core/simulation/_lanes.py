@@ -24,7 +24,7 @@ from refu_core.errors import SimulationError
 from refu_core.simulation import _cloth as cloth
 from refu_core.simulation import _lane_contact_kernels as near_kernels
 from refu_core.simulation import _lane_kernels as kernels
-from refu_core.simulation._cloth import F32, I32, ClothSettings, ClothTopology, Cut, Step
+from refu_core.simulation._cloth import F32, I32, ClothCut, ClothSettings, ClothTopology, CourseStep
 
 _MOST_NEAR = 48
 """Most faces beside a vertex that are looked at. Where a shirt is folded most tightly there are 54."""
@@ -113,7 +113,7 @@ class ClothLanes:
         mass, shortest, longest = (as_warp(one, wp.float32) for one in (self._mass, self._shortest, self._longest))
         flag = {name: as_warp(values, wp.int32) for name, values in self._of_lane.items()}
         origin, course = as_warp(self._origin, vec3), as_warp(self._course, vec3)
-        skin = near_kernels.Skin()
+        skin = near_kernels.LaneSkin()
         skin.mesh, skin.faces, skin.origin = self._mesh.id, ints(body_faces, device), origin
         skin.vertices, skin.motion = (as_warp(self._new(*self._placed.shape), vec3) for _ in range(2))
         skin.reach, skin.near, skin.slide = cloth.REACH, cloth.NEAR, cloth.SLIDE
@@ -197,7 +197,7 @@ class ClothLanes:
             for launch in self._substep:
                 launch.launch()
 
-    def load(self, lane: int, cut: Cut, positions: F32, bodies: F32) -> None:
+    def load(self, lane: int, cut: ClothCut, positions: F32, bodies: F32) -> None:
         """Puts cloth of this cut at `positions` (N, 3), at rest, into a lane; its course is `bodies` (T, V, 3) [m]."""
         face, weights, offset = cut.anchors
         columns: list[tuple[Tensor, NDArray[Any]]] = [
@@ -225,7 +225,7 @@ class ClothLanes:
             found: F32 = self._x[:, lane].clone().cpu().numpy()  # a CPU would give its own memory
         return found
 
-    def frame(self, steps: Sequence[Step | None]) -> NDArray[np.float64]:
+    def frame(self, steps: Sequence[CourseStep | None]) -> NDArray[np.float64]:
         """Takes each lane a step further on its course; an idle one has None.
 
         Returns the root mean square speed of each lane's cloth at the end [m/s], shape (lanes,).
@@ -275,7 +275,7 @@ class ClothLanes:
         self._sides.launch()
 
 
-_IDLE = Step(0, 0, np.zeros(3, np.float32), 0.0)
+_IDLE = CourseStep(0, 0, np.zeros(3, np.float32), 0.0)
 _KIND = {2: wp.float32, 3: wp.vec3}
 
 

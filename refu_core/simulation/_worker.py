@@ -13,7 +13,7 @@ import numpy as np
 from refu_core.body import load_body, load_fit
 from refu_core.garments import load_garment, worn_on
 from refu_core.metrics import CollisionChecker, SheetChecker
-from refu_core.simulation._cloth import F32, Cut
+from refu_core.simulation._cloth import F32, ClothCut
 from refu_core.simulation._drape import Draper, DrapeSettings, SettledDrape
 from refu_core.simulation._joined import JoinedGarments
 from refu_core.simulation._plan import TEST, SamplePlan, garments_of
@@ -111,7 +111,7 @@ class Simulator(ABC):
     def simulate(self, slot: int) -> dict[str, Any]:
         """The columns of a slot's row (see `_store`)."""
 
-    def _examine(self, vertices: F32, body: F32, cut: Cut, *, speed: float = 0.0) -> tuple[str | None, Any]:
+    def _examine(self, vertices: F32, body: F32, cut: ClothCut, *, speed: float = 0.0) -> tuple[str | None, Any]:
         """Why cloth is rejected, if it is, and the cloth as stored: None where it isn't finite or is too far off."""
         if is_lost(vertices):
             return "unsettled", None
