@@ -33,9 +33,12 @@ RADIUS_90 = 2.5003
 """A ball of this many σ around a vertex holds the true one in 90 % of cases: χ's quantile, three degrees of freedom."""
 REGIONS = 3
 """Number of pose regions: equal shares of the samples, from hardly bent to most bent."""
-MOST_TURNED = 1.5
-"""Joints count as having turned by this at most [rad]: where they have turned by 1.3 to 1.9, errors are 1.5 to 2.1
-times as large as at rest."""
+GROWTH, MOST_GROWTH = 3.0, 0.8
+"""How much σ grows by for each radian that joints have turned [1/rad], and at most. In 514 frames of moving T-shirts,
+and 181 of shirts, σ would have to be 1.5 to 1.7 times as large from 0.1 rad on. With these numbers the 90 % interval
+holds 91 and 94 % there, and 78 and 86 % in the faster sequences of a T-shirt and a skirt in bags/."""
+LEAST_SIGMA = 0.0011
+"""Less is never claimed [m]: the truth is simulated, and a skirt whose joints are turned by 0.02° is that far off."""
 _SWEEPS = 10
 """How often errors are averaged with those of neighbours: some fifty samples say too little about a single vertex."""
 
@@ -114,6 +117,7 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     regions = np.array_split(np.argsort(bend, kind="stable"), REGIONS)
     middle = [np.median(bend[rows]) for rows in regions]
     factor = [np.quantile(length[rows] / sigma, 0.9) / RADIUS_90 for rows in regions]
+    sigma = np.maximum(sigma, LEAST_SIGMA / max(min(factor), 1e-3))
     return SigmaMap(sigma.astype(np.float32), np.array(middle, np.float32), np.array(factor, np.float32))
 
 
@@ -179,8 +183,8 @@ class Sigma:
         """σ per coordinate of each garment's vertices [m], by name, shape (V,), for a frame and what was made of it.
 
         A ball of `RADIUS_90` σ holds the true vertex in nine cases of ten, if the input is as stated and the person
-        hardly moves; σ is never NaN. Moving cloth is harder to predict: σ grows by its own size for each radian that
-        joints have turned (`turned_of`), if the frame knows its past.
+        hardly moves; σ is never NaN. Moving cloth is harder to predict: σ grows by up to `MOST_GROWTH` of its own size
+        as joints turn (`turned_of`), if the frame knows its past.
         Raises `FrameError` for anything but a frame, and for a covariance of another shape, not finite, too large, or
         with a negative variance; `MeshError` for anything but an output, and for an output with other garments.
 
@@ -204,7 +208,7 @@ class Sigma:
             garment = self._garments[name]
             sigma = self.maps[name].at(float(bend_of(garment, frame.pose)))
             if frame.past is not None:
-                sigma = sigma * np.float32(1 + min(turned_of(garment, frame.past), MOST_TURNED))
+                sigma = sigma * np.float32(1 + min(GROWTH * turned_of(garment, frame.past), MOST_GROWTH))
             sigma = sigma + np.float32(unseen) * np.maximum(UNKNOWN_SIGMA - sigma, 0).astype(np.float32)
             if pose is not None or transl > 0:
                 variance = sigma.astype(np.float64) ** 2 + transl

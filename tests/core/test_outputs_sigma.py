@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from refu_core import FrameError, GarmentPipeline, MeshError, PoseHistory, SmplFrame, WeightsError, load_garment
 from refu_core.outputs import RADIUS_90, UNKNOWN_SIGMA, Sigma, SigmaMap, bend_of, fit_sigma, load_sigma, save_sigma
-from refu_core.outputs._sigma import MOST_TURNED, turned_of
+from refu_core.outputs._sigma import MOST_GROWTH, turned_of
 from refu_lab.truth import cross_checked, held_out, moments_of
 
 BAGS = Path(__file__).parents[2] / "bags"
@@ -81,7 +81,7 @@ def test_moving_cloth_is_less_sure(garment: str) -> None:
     assert 0.72 < np.mean(shares) < 0.9
     assert np.mean(before) < np.mean(shares) - 0.1
     fast = replace(one.frame, past=np.full((4, 219), 50.0))
-    assert np.allclose(sigma(fast, out)[garment], (1 + MOST_TURNED) * sigma(replace(fast, past=None), out)[garment])
+    assert np.allclose(sigma(fast, out)[garment], (1 + MOST_GROWTH) * sigma(replace(fast, past=None), out)[garment])
 
 
 @given(seed=st.integers(0, 1000), degrees=st.floats(0, 60))
