@@ -55,10 +55,13 @@ class ClothLanes:
 
         `body` (V, 3) [m] is any body of the faces (F, 3); no course may have more than `most_bodies`.
 
-        Raises `SimulationError` for settings with several sweeps in a time step.
+        Raises `SimulationError` for settings with several sweeps in a time step, or searches for contacts at other
+        steps than every so many of a frame.
         """
-        if settings.iterations != 1:
-            raise SimulationError(f"lanes take one sweep per time step, got {settings.iterations}: take shorter steps")
+        if settings.iterations != 1 or settings.substeps % settings.refresh:
+            wanted = "one sweep in a time step, and a whole number of searches in a frame"
+            got = f"{settings.iterations}, and a search every {settings.refresh} of {settings.substeps} steps"
+            raise SimulationError(f"lanes take {wanted}, got {got}: take shorter steps, or the cpu")
         self._device, self._settings, self._topology = device, settings, topology
         n, n_body, n_faces = topology.mesh.n_vertices, len(body), len(topology.mesh.faces)
         n_ends, n_anchors = len(topology.bends) + len(topology.edges), len(anchored)
@@ -183,7 +186,7 @@ class ClothLanes:
             launch(kernels.finish_kernel, each, h, cloth.MAX_SPEED * h, previous, x, v),
         ]  # fmt: skip
         self._graph: Any = None
-        self._width = 0.0
+        self._width = cloth.PAIR_REACH + cloth.PAIR_SLACK  # of a cell of the grid [m]: the largest reach of any lane
         if device.type == "cuda":
             for one_launch in self._substep:
                 one_launch.launch()  # a graph can't load its kernels
