@@ -153,7 +153,7 @@ def test_slots_are_tried_again_and_given_up(clips: Path, tmp_path: Path) -> None
 
 
 def test_what_lanes_cannot_do_is_said(draper: Draper, clips: Path, tmp_path: Path) -> None:
-    with pytest.raises(SimulationError, match="one sweep in a time step, .*got 2"):
+    with pytest.raises(SimulationError, match=r"one sweep in a time step, .*got 2"):
         lanes_of(draper, 1, iterations=2)
     with pytest.raises(SimulationError, match="got 1, and a search every 12 of 40 steps"):
         lanes_of(draper, 1, refresh=12)
