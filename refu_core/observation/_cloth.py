@@ -21,6 +21,7 @@ from refu_core._warp import as_warp, ints
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import symmetric_solver, vertex_normals
 from refu_core.observation._match_kernels import match_kernel
+from refu_core.outputs import SigmaMap
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -37,8 +38,11 @@ class ObservationSettings:
     """Most smooth fields that make up the displacement along the normal."""
     finest: float = 55.0
     """Their largest wave number [rad/m]: waves of 11 cm. A small garment has fewer fields."""
-    amplitude: float = 0.009
-    """Standard deviation of that displacement [m]: the networks' errors along the normal."""
+    amplitude: float = 2.4
+    """Standard deviation of that displacement, in mean σ of the garment (`refu_core.outputs.Sigma`): a network's errors
+    along the normal, which are less where a network is better."""
+    unmeasured: float = 0.0055
+    """Mean σ of a garment whose network hasn't been measured [m]: that of a T-shirt."""
     wave: float = 30.0
     """Wave number up to which fields are about as large as the widest [rad/m]: waves of 20 cm. Beyond, their size falls
     with its square."""
@@ -204,7 +208,7 @@ class Matches(NamedTuple):
 class ObservedCloth:
     """The numbers of one garment that points may change, and how they displace it before it is posed."""
 
-    def __init__(self, garment: GarmentTemplate, settings: ObservationSettings) -> None:
+    def __init__(self, garment: GarmentTemplate, sigma: SigmaMap, settings: ObservationSettings) -> None:
         self._settings = settings
         self._faces = garment.mesh.faces
         n = garment.n_vertices
@@ -213,7 +217,10 @@ class ObservedCloth:
         rest = garment.v_template.detach().cpu().double().numpy()
         self._out = vertex_normals(rest, self._faces).astype(np.float32)
         falls = 1 / (1 + (wave[kept] / settings.wave) ** 2)
-        std = settings.amplitude * falls / np.sqrt((falls**2).sum())
+        typical = float(sigma.sigma.mean()) if sigma.is_measured else settings.unmeasured
+        self.amplitude = settings.amplitude * typical
+        """Standard deviation of the displacement [m]."""
+        std = self.amplitude * falls / np.sqrt((falls**2).sum())
         self._fields = np.ascontiguousarray(fields[:, kept]) * std.astype(np.float32)
         """How far vertices move along the normal with each number [m], shape (V, K)."""
         self.estimate = Estimate(np.full(len(std), settings.remembered), settings.bound)

@@ -23,6 +23,7 @@ from refu_core.observation._cloth import (
     averaged,
     within,
 )
+from refu_core.outputs import Sigma
 from refu_core.realtime import Dressed, GarmentPipeline, PipelineOutput, RootTurn
 
 _LONGEST_GAP = 10.0
@@ -47,12 +48,13 @@ class Observer:
     def __init__(self, pipeline: GarmentPipeline, *, settings: ObservationSettings = DEFAULT_OBSERVATION) -> None:
         """Prepares for the garments of a pipeline: seconds the first time, after which the result is cached.
 
-        Raises `FrameError` for no pipeline, or no settings.
+        Raises `FrameError` for no pipeline, or no settings, and `WeightsError` for a damaged file of σ.
         """
-        require_pipeline(pipeline, "garments", "body", "adjusted", error=FrameError)
+        require_pipeline(pipeline, "garments", "body", "adjusted", "untrained", error=FrameError)
         require_type(settings, ObservationSettings, "ObservationSettings", error=FrameError)
         self._pipeline, self._settings = pipeline, settings
-        self._cloths = {name: ObservedCloth(garment, settings) for name, garment in pipeline.garments.items()}
+        sigma = Sigma(pipeline).maps
+        self._cloths = {name: ObservedCloth(one, sigma[name], settings) for name, one in pipeline.garments.items()}
         body = pipeline.body
         self._skin = body.v_template.detach().cpu().float().clone()
         self._skin_mesh = wp.Mesh(as_warp(self._skin, wp.vec3), ints(body.faces.cpu().ravel(), "cpu"))
@@ -134,7 +136,8 @@ class Observer:
     def _near(self, dressed: Dressed, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The points (N, 3) that may be on a garment: a picture shows more than the person, at any distance."""
         every = [drape.vertices[0].cpu().numpy() for drape in dressed.drapes.values()]
-        reach = self._settings.reach + self._settings.bound * self._settings.amplitude
+        farthest = max(cloth.amplitude for cloth in self._cloths.values())
+        reach = self._settings.reach + self._settings.bound * farthest
         low, high = np.min([v.min(0) for v in every], 0) - reach, np.max([v.max(0) for v in every], 0) + reach
         return points[within(points, low, high)]
 
@@ -181,11 +184,14 @@ def _noise(height: NDArray[np.floating], least: float) -> float:
     as a whole puts off by as much.
     """
     apart = np.abs(np.diff(height))
-    return max(least, _PER_MEDIAN * float(np.median(apart))) if len(apart) else least
+    return max(least, _ALIKE * _PER_MEDIAN * float(np.median(apart))) if len(apart) else least
 
 
 _PER_MEDIAN = 1.48 / 2**0.5
 """Standard deviation of normal numbers by the median difference of two."""
+_ALIKE = 1.5
+"""Noise counts as this much larger: part of what it does is alike in neighbouring cells, where it isn't seen. Points with
+30 mm of noise leave shorts off by 3.5 mm instead of 3.7, which are off by 3.3 without points, and a T-shirt by 4.6."""
 
 
 def _posed(blend: NDArray[np.float32], offset: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -48,7 +48,7 @@ class _Courses:
 
 
 _AHEAD = 2
-"""Attempts that are prepared, for each lane: a block's wait for its canonical drape."""
+"""Attempts for each lane that are prepared ahead: lanes are full while blocks wait for their canonical drapes."""
 
 _simulator: SlotSimulator
 """A helping process's own."""
