@@ -44,6 +44,7 @@ LONGEST = (
     "test_style.py",
     "ros/test_packaging.py",
     "core/test_simulation.py",
+    "core/test_simulation_lanes.py",
     "core/test_fitting_places.py",
     "core/test_stability.py",
     "ros/test_node_requests.py",
