@@ -190,8 +190,10 @@ def _noise(height: NDArray[np.floating], least: float) -> float:
 _PER_MEDIAN = 1.48 / 2**0.5
 """Standard deviation of normal numbers by the median difference of two."""
 _ALIKE = 1.5
-"""Noise counts as this much larger: part of what it does is alike in neighbouring cells, where it isn't seen. With 30 mm of
-noise, and an amplitude of 1.9, shorts are off by 3.4 mm, else by 3.6, and without points by 3.3."""
+"""Noise counts as this much larger: part of what it does is alike in neighbouring cells, where it isn't seen.
+
+With 30 mm of noise, and an amplitude of 1.9, shorts are off by 3.4 mm, else by 3.6, and without points by 3.3.
+"""
 
 
 def _posed(blend: NDArray[np.float32], offset: NDArray[np.float32]) -> NDArray[np.float32]:
