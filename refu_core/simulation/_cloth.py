@@ -34,6 +34,18 @@ class ClothTopology:
     bends: NDArray[np.int32]
     """The two vertices opposite each inner edge, also sorted by colour, shape (B, 2)."""
 
+    @property
+    def ends(self) -> NDArray[np.int32]:
+        """The vertices of all C distance constraints, shape (C, 2). Bends come first: the stiffer edges have the last
+        word in each sweep."""
+        return np.concatenate((self.bends, self.edges))
+
+    def softness(self, settings: ClothSettings) -> F32:
+        """Each constraint's compliance over the square of a time step [1/kg], shape (C,)."""
+        both = settings.bend_compliance, settings.stretch_compliance
+        compliance = np.repeat(both, (len(self.bends), len(self.edges)))
+        return (compliance / settings.substep**2).astype(np.float32)
+
     @staticmethod
     def of(mesh: Connectivity) -> ClothTopology:
         """The topology of a garment. Raises `MeshError` for edges of more than two faces and vertices of none."""
@@ -121,6 +133,7 @@ NEAR = 0.012  # [m]: vertices closer than this have a contact
 SLIDE = 0.003  # [m]: a contact's tangent plane is used until the vertex has moved this far
 PAIR_REACH = 0.007  # [m]: a vertex this close to another part of the cloth gets a self-contact
 PAIR_SLACK = 0.003  # [m]: pairs are searched this much farther out, and anew when a vertex has moved half of it
+PAST_EDGE = 0.02  # share of a face's height: a vertex just past its edge counts for the faces on both sides
 MAX_SPEED = 6.0  # [m/s]
 _APART = 10.0  # [m]: separate pieces are taken to be this far apart at rest, so they are never neighbours
 
@@ -211,13 +224,8 @@ class SimulatedCloth:
         self._sdf = sdf
         self._body_faces = sdf.faces.cpu().numpy().astype(np.int32)
         n = topology.mesh.n_vertices
-        # Bends first: in each sweep the stiffer edges have the last word.
-        ends = np.concatenate((topology.bends, topology.edges))
-        self._ends = ends.astype(np.uint32)  # unsigned: no check for indices that count from the end
-        compliance = np.repeat(
-            (settings.bend_compliance, settings.stretch_compliance), (len(topology.bends), len(topology.edges))
-        )
-        self._softness: F32 = (compliance / settings.substep**2).astype(np.float32)
+        self._ends = topology.ends.astype(np.uint32)  # unsigned: no check for indices that count from the end
+        self._softness = topology.softness(settings)
         self._piece = piece
         self.positions: F32 = np.zeros((n, 3), np.float32)
         self.velocities: F32 = np.zeros((n, 3), np.float32)

@@ -163,7 +163,7 @@ class _Run:
         device: torch.device,
     ) -> None:
         draper, settings = simulator.draper, simulator.settings
-        self._pool, self._tasks, self._attempts = pool, tasks, settings.attempts
+        self._simulator, self._pool, self._tasks = simulator, pool, tasks
         self._lanes = ClothLanes(
             draper.topology,
             draper.body.rest_vertices(torch.zeros(1, N_BETAS))[0].numpy(),
@@ -255,10 +255,10 @@ class _Run:
             dropped = block.dropped.setdefault(slot, np.zeros(len(CAUSES), np.uint8))
             if cause is not None:
                 dropped[CAUSES.index(cause)] += 1
-                if attempt + 1 < self._attempts:
+                if attempt + 1 < self._simulator.settings.attempts:
                     self._ask_for(block, [(slot, attempt + 1)])
                     return
-                row = {name: row[name] for name in ("slot", "pair", "split", "betas", "style")} | {"state": GIVEN_UP}
+                row = self._simulator.begun(slot) | {"state": GIVEN_UP}
             now = time.perf_counter()
             block.rows[slot] = row | {"dropped": dropped, "seconds": now - self._since}
             self._since = now

@@ -5,11 +5,12 @@ Arrays are shaped as in `_lane_contact_kernels`; C is the number of distance con
 
 import warp as wp
 
+from refu_core.simulation._cloth import PAST_EDGE
 from refu_core.simulation._lane_contact_kernels import TINY, Contacts
 
 FIXED = wp.constant(268435456.0)  # 2^28: pushes are added up as whole numbers, whose sum depends on no order
 SHARE = wp.constant(0.25)  # of a lack of distance that one pair closes
-SLACK = wp.constant(0.02)  # a vertex just past the edge of a face counts for the faces on both sides
+SLACK = wp.constant(PAST_EDGE)
 
 
 @wp.kernel(enable_backward=False)

@@ -71,7 +71,7 @@ class ClothLanes:
         self._gravity, self._total = self._new(lanes, 3), self._new(_SUMS, lanes)
         self._held_face = self._new(n_anchors, lanes, dtype=torch.int32)
         self._held_weights, self._held_offset = self._new(n_anchors, lanes, 3), self._new(n_anchors, lanes)
-        names = ("before", "after", "refreshed", "moved_on", "busy", "careful", "wandered")
+        names = ("before", "after", "refreshed", "moved_on", "careful", "wandered")
         self._of_lane = {name: self._new(lanes, dtype=torch.int32) for name in names}
         self._asked = [self._new_asked(rows, lanes) for rows in (n, len(topology.edges))]
         # Bodies and cloth of all lanes stand side by side, on a grid in space: float32 is finest around its middle.
@@ -135,9 +135,8 @@ class ClothLanes:
         pushes = as_warp(self._new(3, n, lanes, dtype=torch.int32), wp.int32)
         centre, edges = as_warp(self._centre, vec3), ints(topology.edges, device)
         cell, apart = as_warp(self._cell, wp.float32), as_warp(self._apart, wp.float32)
-        ends = ints(np.concatenate((topology.bends, topology.edges)), device)
-        compliance = np.repeat((s.bend_compliance, s.stretch_compliance), (len(topology.bends), len(topology.edges)))
-        softness = wp.array((compliance / h**2).astype(np.float32), dtype=wp.float32, device=str(device))
+        ends = ints(topology.ends, device)
+        softness = wp.array(topology.softness(s), dtype=wp.float32, device=str(device))
         held = ints(anchored, device)
         point, motion = (as_warp(self._new(len(anchored), lanes, 3), vec3) for _ in range(2))
         held_at = [as_warp(self._held_face, wp.int32), as_warp(self._held_weights, vec3)]

@@ -190,10 +190,8 @@ class SequenceSimulator(Simulator):
                 caught = caught + 1 if found in GOT_THROUGH else 0
                 found = "unsettled" if found is None and t < moves_from else found
                 vertices[t], cause[t] = stored, 0 if found is None else 1 + CAUSES.index(found)
-                stretch[t], speed[t] = (
-                    cut.stretch(self.draper.topology, cloth.positions),
-                    now,
-                )  # a moving cloth may be fast: no limit on its speed
+                stretch[t] = cut.stretch(self.draper.topology, cloth.positions)
+                speed[t] = now  # a moving cloth may be fast: no limit on its speed
                 if caught == s.most_caught:
                     drape = self.draper.drape(poses[k], betas, style)
                     self.draper.begin(cut, drape.vertices, body)

@@ -11,6 +11,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from refu_core.simulation._cloth import PAST_EDGE
+
 _TINY = np.float32(1e-12)
 
 _Floats = NDArray[np.float32]
@@ -159,7 +161,7 @@ def _separate_pairs(
 ) -> None:
     """Pushes a vertex and a face of the cloth apart to `thickness`, on the side where the vertex was found."""
     one = np.float32(1.0)
-    slack = np.float32(0.02)  # a vertex just past the edge of a face counts for the faces on both sides
+    slack = np.float32(PAST_EDGE)
     for c in range(pair_vertex.shape[0]):
         i = pair_vertex[c]
         a = pair_face[c, 0]

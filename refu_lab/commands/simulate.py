@@ -87,9 +87,10 @@ def run(args: argparse.Namespace) -> int:
         args,
         dict.fromkeys(("shapes", "seconds", "synthetic"), "sequences") | {"input_axes": "motions", "fps": "motions"},
     )
-    if args.device and args.sequences:
+    on_gpu = args.device not in (None, "cpu")
+    if on_gpu and args.sequences:
         raise RefuError("a GPU simulates poses at rest alone: leave --device or --sequences out")
-    if args.device and args.scheduler:
+    if on_gpu and args.scheduler:
         raise RefuError("a GPU is this machine's: leave --device or --scheduler out")
     if find_spec("numba") is None:  # said before the work begins, which imports it
         raise ModuleNotFoundError(name="numba")
