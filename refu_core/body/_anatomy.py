@@ -55,7 +55,7 @@ class ColliderSettings:
     101 of 116 T-shirts and 108 shorts are free with 35 mm, 105 and 112 with 50 mm, 108 and 113 with 70 mm."""
     aside_rounds: int = 3
     """Newton steps that bring an arm out of the body."""
-    crease_rounds: int = 2
+    crease_rounds: int = 3
     """How often skin is brought to its side of the seams: at the groin several of them meet."""
     part_rounds: int = 4
     """Newton steps to the surface between two segments."""
@@ -247,7 +247,7 @@ class Memory:
         for name in ("moved", "near", "boxed", "ends", "touching"):
             setattr(work, name, wp.zeros(n_vertices, dtype=wp.int32, device=str(device)))
         work.front = wp.zeros((n_rounds + 1, n_vertices), dtype=wp.int32, device=str(device))
-        work.share, work.reach = (wp.zeros(n_vertices, dtype=wp.float32, device=str(device)) for _ in range(2))
+        work.around, work.reach = (wp.zeros(n_vertices, dtype=wp.float32, device=str(device)) for _ in range(2))
         work.parted = wp.zeros(n_vertices, dtype=wp.vec3, device=str(device))
         work.hot = wp.zeros(n_edges, dtype=wp.int32, device=str(device))
         work.steps = wp.zeros(n_edges, dtype=wp.vec3, device=str(device))

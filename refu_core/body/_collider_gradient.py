@@ -24,12 +24,10 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
     how, known = collider.settings, collider.anatomy
     farthest, own = known.farthest.to(skin), known.own
     p = skin
-    is_moved = torch.zeros(len(skin), dtype=torch.bool, device=skin.device)
     between, bent = _between(rotation)
     for _ in range(how.crease_rounds):
-        step = _crease_step(known, skin, p, between, bent)
-        is_moved = is_moved | (step.detach() != 0).any(1)
-        p = p + step
+        p = p + _crease_step(known, skin, p, between, bent)
+    is_moved = _is_around(known, (p != skin).any(1))
     p = _within(p, skin, farthest)
     p = _smooth(known, skin, p, is_moved, how.smooth_first)
     points = torch.cat((p, _means(known.caps, p)))
@@ -43,12 +41,10 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
         step = _ways_out(
             known, points, normals, p[vertex], normals[vertex], sunk[vertex], segment, ratio=ratio, keeps=keeps
         )
-        step = _together(step, vertex, len(p))
-        is_moved = is_moved | (step.detach() != 0).any(1)
-        p = p + step
-    is_parted = (p.detach() != start.detach()).any(1)
+        p = p + _together(step, vertex, len(p))
+    is_parted = (p != start).any(1)
     p = torch.where(is_parted[:, None], _within(p, skin, farthest), p)
-    p = _smooth(known, skin, p, is_moved, how.smooth_last)
+    p = _smooth(known, skin, p, is_moved | _is_around(known, is_parted), how.smooth_last)
     for _ in range(how.edge_rounds):
         step = _edge_step(known, points, normals, start, p, touched)
         is_raised = (step.detach() != 0).any(1)
@@ -106,17 +102,31 @@ def _crease_step(known: Anatomy, skin: Tensor, p: Tensor, between: Tensor, bent:
 
 
 def _smooth(known: Anatomy, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: int) -> Tensor:
-    how, away = known.settings, p - skin
+    how, squared = known.settings, ((p - skin) ** 2).sum(1)
     # Where nothing was moved, the length has no derivative.
-    length = torch.where(is_moved, (away * away).sum(1), 1.0).sqrt()
-    share = torch.where(is_moved, (length / how.smooth_full).clamp_max(1) * how.smooth_step, 0.0)[:, None]
+    has_way = squared.detach() > 0
+    around = _largest_around(known, torch.where(has_way, torch.where(has_way, squared, 1.0).sqrt(), 0.0))
+    around = torch.minimum(around, known.farthest.to(skin))
+    share = ((around / how.smooth_full).clamp_max(1) * how.smooth_step)[:, None]
     start, ring = known.mesh.ring
     owner = torch.as_tensor(known.mesh.ring.owner).to(p.device)
     degree = torch.as_tensor(start).diff().to(p)[:, None]
     for _ in range(sweeps):
         mean = torch.zeros_like(p).index_add(0, owner, p[torch.as_tensor(ring).long()]) / degree
-        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, known.farthest.to(skin)), p)
+        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, around), p)
     return p
+
+
+def _largest_around(known: Anatomy, values: Tensor) -> Tensor:
+    """The largest value among each vertex and its neighbours, of values (V,)."""
+    first, second = known.edges.T
+    neighbour, owner = torch.cat((first, second)), torch.cat((second, first))
+    return values.scatter_reduce(0, owner, values[neighbour], "amax")
+
+
+def _is_around(known: Anatomy, chosen: Tensor) -> Tensor:
+    """Which vertices are chosen themselves, or have a neighbour that is, bool, shape (V,)."""
+    return _largest_around(known, chosen.float()) > 0
 
 
 def _ways_out(

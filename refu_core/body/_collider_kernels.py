@@ -116,8 +116,8 @@ class Work:
     """The two buffers that sweeps alternate between."""
     farthest: wp.array[float]
     """How far skin may be moved [m]."""
-    share: wp.array[float]
-    """How much of a sweep each vertex of `moved` takes."""
+    around: wp.array[float]
+    """How far each vertex of `moved`, or a neighbour of it, was moved before it is levelled [m]."""
     moved: wp.array[int]
     near: wp.array[int]
     """Vertices that may be within the gap of another segment, by its boxes."""
@@ -210,8 +210,20 @@ def within(p: wp.vec3, skin: wp.vec3, farthest: float) -> wp.vec3:
 
 
 @wp.func
-def hold(i: int, work: Work, stations: wp.array[wp.vec3], bones: Bones, seams: Seams, rounds: int) -> None:
-    """Brings skin back to its own side of the nearby seams, above all of those that it is farthest beyond."""
+def enlist(v: int, work: Work) -> None:
+    """Adds a vertex to `moved`, once."""
+    if wp.atomic_max(work.is_moved, v, 1) == 0:
+        work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
+
+
+@wp.func
+def hold(
+    i: int, work: Work, stations: wp.array[wp.vec3], bones: Bones, seams: Seams, rings: Rings, rounds: int
+) -> None:
+    """Brings skin back to its own side of the nearby seams, above all of those that it is farthest beyond.
+
+    The skin next to it is levelled, too: at the end of a fold, at the groin, it would be left standing as a ridge.
+    """
     v = seams.vertex[i]
     p = work.skin[v]
     is_held = int(0)
@@ -240,24 +252,36 @@ def hold(i: int, work: Work, stations: wp.array[wp.vec3], bones: Bones, seams: S
         p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
         work.there[v] = p
-        work.is_moved[v] = 1
-        work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
+        enlist(v, work)
+        for k in range(rings.start[v], rings.start[v + 1]):
+            enlist(rings.vertex[k], work)
 
 
 @wp.func
-def find_share(v: int, work: Work, full: float, step: float) -> None:
-    """Finds how much of a sweep a vertex takes: all of `step` where it was moved by `full` [m] or farther."""
-    work.share[v] = wp.min(wp.length(work.here[v] - work.skin[v]) / full, 1.0) * step
+def look_around(v: int, work: Work, rings: Rings) -> None:
+    """Finds how far a vertex or a neighbour of it was moved."""
+    way = wp.length(work.here[v] - work.skin[v])
+    for k in range(rings.start[v], rings.start[v + 1]):
+        w = rings.vertex[k]
+        way = wp.max(way, wp.length(work.here[w] - work.skin[w]))
+    work.around[v] = wp.min(way, work.farthest[v])
 
 
 @wp.func
-def level(v: int, work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]) -> None:
-    """Levels a vertex that was moved: it goes towards the mean of its neighbours."""
+def level(
+    v: int, full: float, step: float, work: Work, rings: Rings, source: wp.array[wp.vec3], target: wp.array[wp.vec3]
+) -> None:
+    """Levels a vertex: it goes towards the mean of its neighbours, by `step` where one was moved by `full` [m].
+
+    By that it gets no farther from the skin than what is around it.
+    """
+    around = work.around[v]
     total = wp.vec3()
     for k in range(rings.start[v], rings.start[v + 1]):
         total += source[rings.vertex[k]]
     mean = total / float(rings.start[v + 1] - rings.start[v])
-    target[v] = within(source[v] + work.share[v] * (mean - source[v]), work.skin[v], work.farthest[v])
+    share = step * wp.min(around / full, 1.0)
+    target[v] = within(source[v] + share * (mean - source[v]), work.skin[v], around)
 
 
 @wp.func

@@ -8,13 +8,13 @@ from refu_core.body._collider_kernels import (
     ENDS,
     FRONT,
     HOT,
-    MOVED,
     NEAR,
     TOUCHING,
     WANTED,
     Bones,
     Rings,
     Work,
+    enlist,
     within,
 )
 from refu_core.body._pose_kernels import turned
@@ -235,9 +235,9 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
         p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
         work.there[v] = p
-        if work.is_moved[v] == 0:
-            work.is_moved[v] = 1
-            work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
+        enlist(v, work)
+        for k in range(rings.start[v], rings.start[v + 1]):
+            enlist(rings.vertex[k], work)
     for r in range(rings.start[v], rings.start[v + 1]):
         e = rings.edge[r]
         w = rings.vertex[r]

@@ -20,9 +20,9 @@ from refu_core.body._collider_kernels import (
     Seams,
     Work,
     find_mean,
-    find_share,
     hold,
     level,
+    look_around,
     settle,
 )
 from refu_core.body._part_kernels import Segments, Skins, deepen, find_near, follow, part, raise_edge, touch
@@ -45,14 +45,14 @@ def smooth(
     """
     if is_due(before, only):
         for i in range(first, work.counts[MOVED], stride):
-            find_share(work.moved[i], work, full, share)
+            look_around(work.moved[i], work, rings)
     for sweep in range(sweeps):
         if is_due(before + 1 + sweep, only):
             for i in range(first, work.counts[MOVED], stride):
                 if sweep % 2 == 0:
-                    level(work.moved[i], work, rings, work.here, work.there)
+                    level(work.moved[i], full, share, work, rings, work.here, work.there)
                 else:
-                    level(work.moved[i], work, rings, work.there, work.here)
+                    level(work.moved[i], full, share, work, rings, work.there, work.here)
 
 
 @wp.kernel
@@ -76,7 +76,7 @@ def unfold_kernel(
             find_mean(i, work.skin, stations)
     if is_due(1, only):
         for i in range(first, seams.vertex.shape[0], stride):
-            hold(i, work, stations.mean, bones, seams, rounds)
+            hold(i, work, stations.mean, bones, seams, rings, rounds)
     smooth(2, only, first, stride, work, rings, sweeps, full, share)
     if is_due(3 + sweeps, only):
         for i in range(first, work.counts[MOVED], stride):
