@@ -29,7 +29,8 @@ class Collider(Unpicklable):
     3. *Segments.* Parts that overlap, or are nearer than the gap, each give way, according to their softness, until
        they are on their own side of the surface half way between them: ReFU with the distance of one part from the
        other. No two parts can then be at the same place.
-    4. Dents are levelled, and edges that cut corners are raised.
+    4. What was moved is levelled, and the skin next to it, so that no ridge is left beside a dent. Edges that cut
+       corners are raised.
 
     The result depends on the pose alone, not on earlier frames, and changes continuously with it. Nothing moves where
     nothing is near: skin keeps no more distance than it has in the rest pose.

@@ -90,6 +90,19 @@ def test_a_pose_that_runs_through_itself_is_pulled_apart(
     assert (apart - skin.vertices).norm(dim=2).max() < 40 * MM
 
 
+@pytest.mark.parametrize("both", [False, True], ids=["one leg", "both legs"])
+@pytest.mark.parametrize("spread", [0.0, 0.15, 0.3])
+def test_no_ridge_is_left_at_the_end_of_a_fold(
+    spread: float, both: bool, body: SmplBody, collider: Collider, detector: SelfContactDetector
+) -> None:
+    """At the groin, where the fold of a lifted leg ends: up to 90 degrees, skin has room there."""
+    for angle in np.arange(0.7, 1.65, 0.1):
+        turns = {"left_hip": (-angle, 0, spread)} | ({"right_hip": (-angle, 0, -spread)} if both else {})
+        skin = body(pose=posed(body, turns))
+        apart = collider(skin.vertices, skin.transforms)
+        assert not len(detector.detect(apart[0]).pairs), f"{angle:.1f} rad"
+
+
 def test_what_is_far_from_an_overlap_stays(body: SmplBody, collider: Collider) -> None:
     skin = body(pose=posed(body, POSES["bent elbows"]))
     apart = collider(skin.vertices, skin.transforms)
