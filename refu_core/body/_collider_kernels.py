@@ -210,20 +210,25 @@ def within(p: wp.vec3, skin: wp.vec3, farthest: float) -> wp.vec3:
 
 
 @wp.func
-def enlist(v: int, work: Work) -> None:
+def add(v: int, work: Work) -> None:
     """Adds a vertex to `moved`, once."""
     if wp.atomic_max(work.is_moved, v, 1) == 0:
         work.moved[wp.atomic_add(work.counts, MOVED, 1)] = v
 
 
 @wp.func
+def enlist(v: int, work: Work, rings: Rings) -> None:
+    """Adds a vertex that was moved, and the skin next to it: left as it is, that would stand as a ridge."""
+    add(v, work)
+    for k in range(rings.start[v], rings.start[v + 1]):
+        add(rings.vertex[k], work)
+
+
+@wp.func
 def hold(
     i: int, work: Work, stations: wp.array[wp.vec3], bones: Bones, seams: Seams, rings: Rings, rounds: int
 ) -> None:
-    """Brings skin back to its own side of the nearby seams, above all of those that it is farthest beyond.
-
-    The skin next to it is levelled, too: at the end of a fold, at the groin, it would be left standing as a ridge.
-    """
+    """Brings skin back to its own side of the nearby seams, above all of those that it is farthest beyond."""
     v = seams.vertex[i]
     p = work.skin[v]
     is_held = int(0)
@@ -252,9 +257,7 @@ def hold(
         p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
         work.there[v] = p
-        enlist(v, work)
-        for k in range(rings.start[v], rings.start[v + 1]):
-            enlist(rings.vertex[k], work)
+        enlist(v, work, rings)
 
 
 @wp.func

@@ -235,9 +235,7 @@ def part(v: int, work: Work, segments: Segments, bones: Bones, rings: Rings, rou
         p = within(p, work.skin[v], work.farthest[v])
         work.here[v] = p
         work.there[v] = p
-        enlist(v, work)
-        for k in range(rings.start[v], rings.start[v + 1]):
-            enlist(rings.vertex[k], work)
+        enlist(v, work, rings)
     for r in range(rings.start[v], rings.start[v + 1]):
         e = rings.edge[r]
         w = rings.vertex[r]
