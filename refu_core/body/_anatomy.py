@@ -56,8 +56,8 @@ class ColliderSettings:
     aside_rounds: int = 3
     """Newton steps that bring an arm out of the body."""
     crease_rounds: int = 3
-    """How often skin is brought to its side of the seams: at the groin several of them meet. With two rounds some
-    faces of a male body that sits still cut each other there."""
+    """How often skin is brought to its side of the seams: at the groin several of them meet. With two rounds faces
+    of a sitting male body cut each other there."""
     part_rounds: int = 4
     """Newton steps to the surface between two segments."""
     deepen_rounds: int = 8
@@ -65,9 +65,9 @@ class ColliderSettings:
     smooth_first: int = 3
     """Smoothing sweeps over creases, before segments are parted."""
     smooth_last: int = 1
-    """Smoothing sweeps over all skin that was moved, after that."""
+    """Smoothing sweeps over all skin that was moved, and what is next to it, after that."""
     smooth_full: float = 0.004
-    """Skin that was moved this far is levelled in full [m]; skin that was moved less is levelled less."""
+    """Skin that was moved this far, or is next to such skin, is levelled in full [m]; less of a move levels it less."""
     smooth_step: float = 0.5
     """Share of the way to the mean of its neighbours that a sweep moves a vertex."""
     edge_rounds: int = 2

@@ -119,6 +119,7 @@ class Work:
     around: wp.array[float]
     """How far each vertex of `moved`, or a neighbour of it, was moved before it is levelled [m]."""
     moved: wp.array[int]
+    """Vertices that were moved, and their neighbours: those that are levelled."""
     near: wp.array[int]
     """Vertices that may be within the gap of another segment, by its boxes."""
     boxed: wp.array[int]
