@@ -60,8 +60,9 @@ class SamplePlan:
     recorded_share: float = 0.6
     """Share of poses that are frames of motions."""
     posture_share: float = 0.0
-    """Share of poses that are varied everyday postures (`POSTURES`); the rest are drawn within the limits of human
-    joints."""
+    """Share of poses that are varied everyday postures (`POSTURES`)."""
+    acrobatic_share: float = 0.0
+    """Share of poses of acrobats (`acrobatic_pose`); the rest are drawn within the limits of human joints."""
     spread: float = 1.2
     """Standard deviation of β and γ before they are cut off at ±2."""
     block: int = 12
@@ -72,7 +73,7 @@ class SamplePlan:
     def __post_init__(self) -> None:
         """Raises `SimulationError` for values that make no plan; plans are also read from cards."""
         whole = self.count, self.seed, self.pivots, self.poses_per_pair, self.block
-        shares = self.test_share, self.recorded_share, self.posture_share, self.spread
+        shares = self.test_share, self.recorded_share, self.posture_share, self.acrobatic_share, self.spread
         is_named = isinstance(self.garment, (str, list, tuple)) and all(isinstance(name, str) for name in self.garment)
         is_whole = all(isinstance(number, int) and 0 <= number <= _MOST for number in whole)
         if not (is_named and is_whole and all(isinstance(share, Real) for share in shares)):
@@ -85,7 +86,7 @@ class SamplePlan:
             known = f"{', '.join(POSTURES)[:160]}…"
             raise SimulationError(f"wanted names of postures, from {known}, got {str(self.postures)[:80]}")
         object.__setattr__(self, "postures", list(self.postures))  # as a card has it
-        of_poses = self.recorded_share, self.posture_share
+        of_poses = self.recorded_share, self.posture_share, self.acrobatic_share
         if not (0 <= self.test_share < 1 and min(of_poses) >= 0 and sum(of_poses) <= 1 and self.spread > 0):
             wanted = "shares must lie in [0, 1), those of poses sum up to 1 at most, and the spread be above 0"
             raise SimulationError(f"{wanted}, got {asdict(self)}")
@@ -145,5 +146,11 @@ class SamplePlan:
     def pose(self, slot: int, attempt: int, clips: Sequence[Clip]) -> tuple[NDArray[np.float32], int, int]:
         """The pose that a slot tries at its `attempt`, and its clip and frame, as `drawn_pose` tells them."""
         rng = np.random.default_rng(self._key(3, slot, attempt))
-        shares = {"recorded_share": self.recorded_share, "posture_share": self.posture_share}
-        return drawn_pose(clips, rng, **shares, postures=self.postures)
+        return drawn_pose(
+            clips,
+            rng,
+            recorded_share=self.recorded_share,
+            posture_share=self.posture_share,
+            acrobatic_share=self.acrobatic_share,
+            postures=self.postures,
+        )

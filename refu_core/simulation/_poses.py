@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,6 +36,15 @@ _LIMITS: dict[int, tuple[tuple[float, float], tuple[float, float], tuple[float, 
     18: ((-20, 20), (-120, 0), (-10, 10)),
     20: ((-20, 20), (-15, 15), (-30, 30)),
 }
+_ACROBATS = _LIMITS | {
+    0: ((0, 0), (0, 0), (0, 0)),
+    1: ((-125, 40), (-25, 60), (-15, 65)),
+    3: ((-20, 35), (-20, 20), (-20, 20)),
+    4: ((0, 135), (-5, 5), (0, 0)),
+}
+"""Those of people who kick, roll, climb or turn cartwheels: legs and back go farther."""
+_MOST_TILT = 120.0
+"""How far acrobats are tilted from upright at most [degrees]: farther, loose cloth falls over the rest of the body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,16 +139,26 @@ def mirrored(poses: NDArray[np.floating]) -> NDArray[np.float32]:
     return poses[..., MIRRORED_JOINTS, :] * np.array([1, -1, -1], np.float32)
 
 
-def random_pose(rng: np.random.Generator) -> NDArray[np.float32]:
+def random_pose(
+    rng: np.random.Generator, limits: Mapping[int, Sequence[tuple[float, float]]] = _LIMITS
+) -> NDArray[np.float32]:
     """A pose (24, 3) within the limits of human joints [rad]; the middle of each range is likelier than its ends."""
     pose = np.zeros((N_JOINTS, 3))
-    for joint, ranges in _LIMITS.items():
+    for joint, ranges in limits.items():
         low, high = np.radians(ranges).T
         pose[joint] = low + (high - low) * rng.beta(1.6, 1.6, 3)
         other = MIRRORED_JOINTS[joint]
         if other != joint:
             pose[other] = (low + (high - low) * rng.beta(1.6, 1.6, 3)) * (1, -1, -1)
     return pose.astype(np.float32)
+
+
+def acrobatic_pose(rng: np.random.Generator) -> NDArray[np.float32]:
+    """A pose (24, 3) of somebody tilted in any direction, with legs as far up and apart as acrobats' go [rad]."""
+    pose = random_pose(rng, _ACROBATS)
+    way, tilt = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(0, _MOST_TILT))
+    pose[0] = tilt * np.array([np.cos(way), 0, np.sin(way)])
+    return without_heading(pose)
 
 
 def clip_pose(clips: Sequence[Clip], rng: np.random.Generator) -> tuple[NDArray[np.float32], int, int]:
@@ -232,9 +251,10 @@ def drawn_pose(
     *,
     recorded_share: float,
     posture_share: float,
+    acrobatic_share: float = 0.0,
     postures: Sequence[str] = FIRST_POSTURES,
 ) -> tuple[NDArray[np.float32], int, int]:
-    """A clip's frame, one of the postures, varied, or a pose within joints' limits: (24, 3) [rad], clip and frame.
+    """A clip's frame, a varied posture, an acrobat's pose or one within joints' limits, (24, 3) [rad]; clip and frame.
 
     Without a clip its number is -1 and the frame is the posture's number, or -1 for a random pose.
     """
@@ -244,4 +264,5 @@ def drawn_pose(
     if recorded_share <= kind < recorded_share + posture_share:
         pose, which = drawn_posture(rng, postures)
         return pose, -1, which
-    return random_pose(rng), -1, -1
+    is_acrobatic = recorded_share + posture_share <= kind < recorded_share + posture_share + acrobatic_share
+    return acrobatic_pose(rng) if is_acrobatic else random_pose(rng), -1, -1
