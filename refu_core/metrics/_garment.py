@@ -154,9 +154,11 @@ class GarmentMetrics:
 
         `truth` are the true vertices, if there are any. The local Laplacian error is over the vertices that `resolved`,
         bool, (N,), marks: those that collided before collisions were handled (the supplement's "initial collided
-        vertex"); over all by default. Raises `MeshError` for arrays whose shapes don't belong together.
+        vertex"); over all by default. Raises `MeshError` for arrays whose shapes don't belong together, and for another
+        number of vertices than in the frames before.
         """
-        garment = as_vertices("the garment's vertices", vertices)
+        known = self._frames[0].n_vertices if self._frames else None
+        garment = as_vertices("the garment's vertices", vertices, known)
         n = len(garment)
         target = None if truth is None else as_vertices("truth", truth)
         region = np.ones(n, np.bool_) if resolved is None else np.asarray(resolved, dtype=np.bool_)
