@@ -161,6 +161,7 @@ class MarkerArrayEncoder:
         if axes not in SMPL_COLUMNS:
             raise EncodeError(f"wanted axes {' or '.join(SMPL_COLUMNS)}, got {axes!r}")
         self._columns = SMPL_COLUMNS[axes]
+        self._anew = partial(type(self), tuple(meshes), frame_id=frame_id, axes=axes, lifetime_ns=lifetime_ns)
         writer = CdrWriter()
         writer.fields("I", len(meshes))
         write = partial(_write_marker, writer, frame_id=frame_id, lifetime_ns=lifetime_ns)
@@ -177,6 +178,10 @@ class MarkerArrayEncoder:
             corners = np.ascontiguousarray(mesh.faces, dtype=np.intp).reshape(-1)
             points = payload[points_at : points_at + corners.size * 24].view("<f8").reshape(-1, 3)
             self._slots.append(_Slot(mesh, corners, stamp_at, points, np.empty((mesh.n_vertices, 3))))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy, or what another process gets, is made anew: views of a message don't stay views of it."""
+        return self._anew, ()
 
     def encode(
         self, vertices: Sequence[ArrayLike], *, stamp_ns: int | Sequence[int], transl: ArrayLike | None = None

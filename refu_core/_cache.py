@@ -53,15 +53,20 @@ def _content(value: Any) -> Any:
 
 
 def cache_folder() -> Path:
-    """`REFU_CACHE`, or `refu` in the user's cache folder (`XDG_CACHE_HOME`, ~/.cache); it need not exist yet."""
-    chosen = os.environ.get("REFU_CACHE")
-    if chosen:
-        return Path(chosen)
-    home = os.environ.get("XDG_CACHE_HOME")
+    """`REFU_CACHE`, or `refu` in the user's cache folder (`XDG_CACHE_HOME`, ~/.cache); it need not exist yet.
+
+    A relative one is in the working directory of the first call, wherever the program goes afterwards.
+    """
+    own, shared = os.environ.get("REFU_CACHE"), os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     try:
-        return (Path(home) if home else Path.home() / ".cache") / "refu"
-    except RuntimeError:  # a user without a home
+        return _in_full((Path(own) if own else Path(shared, "refu")).expanduser())
+    except (RuntimeError, OSError):  # a user without a home, a working directory that was removed
         return Path(tempfile.gettempdir()) / "refu"
+
+
+@cache
+def _in_full(folder: Path) -> Path:
+    return folder.absolute()
 
 
 def recall(name: str, *, keys: Collection[str]) -> dict[str, NDArray[Any]] | None:

@@ -74,10 +74,12 @@ def _train(
         few = _seeded(training.CarrySettings(), options, **steps)
         return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
     common |= {"backbone": options.backbone, "preset": options.preset}
-    of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
-    count = sum(int(one.train.sum()) for one in datasets) + (0 if rehearsal is None else rehearsal.most)
-    first = training.PretrainSettings.of(options.backbone, options.preset, samples=count)
-    first = _seeded(first, options, **of_all)
+    of_all = {stage: n for stage in ("style_shape_steps", "low_steps", "steps") for n in steps.values()}
+
+    def first(samples: int) -> training.PretrainSettings:
+        whole = training.PretrainSettings.of(options.backbone, options.preset, samples=samples)
+        return replace(whole, loop=replace(whole.loop, seed=options.seed), **of_all)
+
     if options.start is not None:
         common |= {"start": options.start, "mode": options.mode, "joints": _numbers(options.joints)}
         return training.pretrain(*given, settings=first, rehearsal=rehearsal, **common)

@@ -28,6 +28,7 @@ from refu_core.backbones._presets import BackboneConfig as BackboneConfig
 from refu_core.backbones._presets import Network as Network
 from refu_core.backbones._presets import backbone_config as backbone_config
 from refu_core.backbones._presets import backbone_from_weights as backbone_from_weights
+from refu_core.backbones._presets import backbone_stem as backbone_stem
 from refu_core.backbones._presets import backbone_weights as backbone_weights
 from refu_core.backbones._presets import build_backbone as build_backbone
 from refu_core.backbones._presets import carried_dynamics as carried_dynamics

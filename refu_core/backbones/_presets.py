@@ -337,6 +337,15 @@ def load_backbone(
 
 def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:
     """The weights that `load_backbone` uses; None for `skinned`, and for `auto` if none ship. Raises as it does."""
+    stem = backbone_stem(name, garment, mode=mode, folder=folder)
+    return None if stem is None else load_weights(stem, expect={"garment": garment})
+
+
+def backbone_stem(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Path | None:
+    """The path of those weights without a suffix, or None; they aren't opened.
+
+    Raises `WeightsError` for no such backbone or mode.
+    """
     kind = BackboneName.of(name, "backbone", error=WeightsError)
     mode = SdfMode.of(mode, "mode of a backbone", error=WeightsError)
     shipped = weights_folder(garment)
@@ -346,4 +355,4 @@ def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None 
         return None
     if kind in (BackboneName.AUTO, BackboneName.DYNAMIC):  # `dynamic` is a tailornet, and more
         kind = BackboneName.TAILORNET
-    return load_weights(folder / f"{kind}-{mode}", expect={"garment": garment})
+    return folder / f"{kind}-{mode}"

@@ -62,7 +62,9 @@ class TailorNet(nn.Module):
         )
         self.style_shape = Perceptron(N_STYLE_SHAPE, config.style_shape, n_code, activation=activation)
         self.register_buffer("pivots", pivots.clone())
-        self.register_buffer("_directions", decoder.directions(garment), persistent=False)
+        # They take 12 ms, and aren't needed where a card's sizes are tried out without memory (`build_for`).
+        directions = None if torch.empty(0).is_meta else decoder.directions(garment)
+        self.register_buffer("_directions", directions, persistent=False)
         self.pivots: Tensor
         self._directions: Tensor
 

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import ints
+from refu_core._warp import Unpicklable, ints
 from refu_core.body._part_kernels import nearest_kernel
 from refu_core.mesh import vertex_normals
 
@@ -26,7 +26,7 @@ class OnSurface(NamedTuple):
         return np.asarray(np.einsum("nk,nk...->n...", self.weight, values[faces[self.face]]))
 
 
-class Surface:
+class Surface(Unpicklable):
     """A triangle mesh that finds its points closest to others, on the CPU."""
 
     def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> None:

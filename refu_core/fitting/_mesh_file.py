@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from refu_core._files import parse_json, read_file
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.errors import GarmentError
 from refu_core.garments import UvMap
 
@@ -54,9 +55,9 @@ class SurfaceMesh:
 
     def __post_init__(self) -> None:
         try:
-            v = np.asarray(self.vertices, np.float64).reshape(-1, 3)
-            f = np.asarray(self.faces).astype(np.int64, casting="same_kind").reshape(-1, 3)
-        except (TypeError, ValueError) as error:
+            v = np.asarray(as_numbers(self.vertices, also="U"), np.float64).reshape(-1, 3)  # NumPy judges text
+            f = as_numbers(self.faces).astype(np.int64, casting="same_kind").reshape(-1, 3)
+        except NOT_NUMBERS as error:
             raise GarmentError(str(error)) from error
         vars(self).update(vertices=v, faces=f)
         if not len(f):

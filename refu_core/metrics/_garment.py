@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, check_faces
 from refu_core.metrics._collisions import Collisions, as_vertices
@@ -122,8 +123,18 @@ class FoldBands:
         self._sweep = sparse.csr_array(sparse.eye_array(mesh.n_vertices) - 0.5 * mesh.uniform_laplacian())
 
     def split(self, vertices: Any) -> NDArray[np.float64]:
-        """The bands of arrays (V, ...) over the vertices, finest first, and what is left: (5, V, ...). They add up."""
-        array = np.asarray(vertices, np.float64)
+        """The bands of arrays (V, ...) over the vertices, finest first, and what is left: (5, V, ...). They add up.
+
+        Raises `MeshError` for anything but finite numbers of that shape.
+        """
+        n = self._sweep.shape[0]
+        try:
+            array = np.asarray(as_numbers(vertices), np.float64)
+        except NOT_NUMBERS as error:
+            wanted = f"wanted numbers of the shape ({n}, ...), got {type(vertices).__name__}"
+            raise MeshError(f"{wanted}: {error}") from error
+        if array.shape[:1] != (n,) or not np.isfinite(array).all():
+            raise MeshError(f"wanted finite numbers of the shape ({n}, ...), got {array.shape}")
         rest = array.reshape(len(array), -1)
         bands = []
         for n_sweeps in SWEEPS:
@@ -154,9 +165,11 @@ class GarmentMetrics:
 
         `truth` are the true vertices, if there are any. The local Laplacian error is over the vertices that `resolved`,
         bool, (N,), marks: those that collided before collisions were handled (the supplement's "initial collided
-        vertex"); over all by default. Raises `MeshError` for arrays whose shapes don't belong together.
+        vertex"); over all by default. Raises `MeshError` for arrays whose shapes don't belong together, and for another
+        number of vertices than in the frames before.
         """
-        garment = as_vertices("the garment's vertices", vertices)
+        known = self._frames[0].n_vertices if self._frames else None
+        garment = as_vertices("the garment's vertices", vertices, known)
         n = len(garment)
         target = None if truth is None else as_vertices("truth", truth)
         region = np.ones(n, np.bool_) if resolved is None else np.asarray(resolved, dtype=np.bool_)

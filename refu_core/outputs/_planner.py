@@ -176,9 +176,9 @@ class PlannerMesh:
         """Prepares for a garment: some seconds the first time, after which the result is cached (`REFU_CACHE`).
 
         The solid has `max_triangles` at most, and its sides are `half_thickness` [m] from the middle of the cloth.
-        `worn` returns the garment as it is worn in several poses [m], (P, V, 3), and is called if nothing is cached;
-        without it only the rest pose is used. Raises `MeshError` for fewer than 100 triangles, for no thickness, and if
-        a garment can't be made that coarse.
+        `worn` returns the garment as it is worn in several poses [m], (P, V, 3); without it only the rest pose is used.
+        What is cached is recalled for the same shapes alone. Raises `MeshError` for fewer than 100 triangles, for no
+        thickness, and if a garment can't be made that coarse.
         """
         require_garment(garment)
         numbers: tuple[object, ...] = max_triangles, half_thickness
@@ -210,7 +210,7 @@ class PlannerMesh:
         *,
         half_thickness: float = HALF_THICKNESS,
     ) -> PlannerMesh:
-        """For a pipeline's garment of this name, which the pipeline drapes in ten poses the first time.
+        """For a pipeline's garment of this name, which the pipeline drapes in ten poses.
 
         Raises `MeshError` as the constructor does, and where the pipeline has no such garment.
         """
@@ -243,12 +243,13 @@ def _prepared(
     garment: GarmentTemplate, rest: NDArray[np.float64], max_triangles: int, worn: Callable[[], Points] | None
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], csr_array]:
     """The vertices that are kept, the sheet's faces and its weights; computed once for a garment, and then cached."""
-    digest = hashlib.sha256(rest.astype(np.float32).tobytes() + garment.mesh.faces.tobytes()).hexdigest()[:16]
-    name = f"planner-{_VERSION}-{digest}-{max_triangles}{'-worn' if worn else ''}"
+    shapes = rest[None] if worn is None else np.concatenate((rest[None], worn()))
+    # Of all shapes: other networks, another body or other garments beside it drape the same garment differently.
+    digest = hashlib.sha256(shapes.astype(np.float32).tobytes() + garment.mesh.faces.tobytes()).hexdigest()[:16]
+    name = f"planner-{_VERSION}-{digest}-{max_triangles}"
     keys = ("kept", "sheet", "weight", "column", "start")
     known = recall(name, keys=keys)
     if known is None:
-        shapes = rest[None] if worn is None else np.concatenate((rest[None], worn()))
         kept, sheet = CoarseSheet(shapes, garment.mesh.faces).collapsed(max_triangles)
         take = fitted_means(shapes, garment.mesh, kept, sheet)
         known = dict(zip(keys, (kept, sheet, take.data, take.indices, take.indptr), strict=True))

@@ -97,8 +97,8 @@ def fit_sigma(garment: GarmentTemplate, errors: NDArray[Any], poses: NDArray[Any
     """
     require_garment(garment)
     try:
-        length, where = np.asarray(errors, np.float64), np.asarray(poses, np.float64)
-    except (TypeError, ValueError) as error:
+        length, where = (np.asarray(as_numbers(one), np.float64) for one in (errors, poses))
+    except NOT_NUMBERS as error:
         raise MeshError(f"errors and poses must be arrays of numbers: {error}") from error
     n = len(length)
     is_shaped = length.shape == (n, garment.n_vertices) and where.shape == (n, N_JOINTS, 3)

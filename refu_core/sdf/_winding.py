@@ -6,14 +6,14 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import IN_ROW, Repeated, as_warp, memory, strips
+from refu_core._warp import IN_ROW, Repeated, Unpicklable, as_warp, memory, strips
 from refu_core.mesh import Connectivity
 from refu_core.sdf._winding_kernels import CELLS, bin_kernel, crossings_kernel, extent_kernel
 
 _N_CELLS = int(CELLS)
 
 
-class Winding:
+class Winding(Unpicklable):
     """The winding numbers of a closed mesh at points, exact for float32 vertices.
 
     A point is inside where its winding number isn't 0, also where limbs run into each other. The number has nothing in

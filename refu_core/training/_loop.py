@@ -122,6 +122,8 @@ class Loop:
             optimiser.load_state_dict(saved["optimiser"])
             order.set_state(saved["order"])
             torch.set_rng_state(saved["rng"])
+            if rank == 0:  # whose state it is: with the same on every GPU, dropout would leave out the same numbers
+                _set_gpu_state(self._device, saved.get("gpu_rng"))
             step, best, best_state, since = saved["step"], saved["best"], saved["best_state"], saved["since"]
         self._log.begin(stage.name, step=step, steps=stage.steps)
         stepper: nn.Module = objective
@@ -174,6 +176,7 @@ class Loop:
                         "optimiser": optimiser.state_dict(),
                         "order": order.get_state(),
                         "rng": torch.get_rng_state(),
+                        **_gpu_state(self._device),
                     }
                 )
         if best_state is not None:
@@ -198,6 +201,16 @@ class Loop:
         if is_writer():
             state = {"identity": self._identity, "done": self._done, "stage": stage, "model": self._model.state_dict()}
             save_checkpoint(self.checkpoint, state)
+
+
+def _gpu_state(device: torch.device) -> dict[str, Tensor]:
+    """The state of a GPU's random numbers, which dropout there draws from; nothing for a CPU."""
+    return {"gpu_rng": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
+
+
+def _set_gpu_state(device: torch.device, state: Tensor | None) -> None:
+    if device.type == "cuda" and state is not None:  # a checkpoint may be of a CPU, or of an earlier version
+        torch.cuda.set_rng_state(state, device)
 
 
 def start_parallel(device: str) -> torch.device:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,7 @@ def pretrain(
     *,
     backbone: str = "tailornet",
     preset: str = "realtime",
-    settings: PretrainSettings | None = None,
+    settings: PretrainSettings | Callable[[int], PretrainSettings] | None = None,
     config: nets.BackboneConfig | None = None,
     start: str | Path | None = None,
     mode: str = "none",
@@ -98,7 +98,7 @@ def pretrain(
         output: folder of the weights, of the checkpoint while it is needed, and of the loss curves.
         backbone: `tailornet`, `mlp` or `gcnn`.
         preset: `realtime` or `paper`.
-        settings: the backbone's own in the preset if not given.
+        settings: or what gives them for a number of samples; the backbone's own in the preset if not given.
         config: sizes of the network; the preset's if not given. A network that goes on from `start` keeps its own.
         start: folder of the weights and basis to go on from, by the last stage only; None to start from scratch.
         mode: mode of the weights in `start` to go on from, and of those written; a ReFU layer stays as it is.
@@ -115,8 +115,9 @@ def pretrain(
     opened = data.TrainingSet.of(garment, datasets, body, may_be_empty=rehearsal is not None)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
     test = opened.test()  # a missing test split is reported first
-    most = len(samples) + (0 if rehearsal is None else rehearsal.most)
-    settings = PretrainSettings.of(backbone, preset, samples=most) if settings is None else settings
+    if not isinstance(settings, PretrainSettings):
+        most = len(samples) + (0 if rehearsal is None else rehearsal.most)
+        settings = PretrainSettings.of(backbone, preset, samples=most) if settings is None else settings(most)
     if start is None and (rehearsal is not None or joints or mode != "none"):
         raise RefuError("there is nothing to go on from or to rehearse without weights to start from")
     torch_device, output = start_parallel(device), Path(output)

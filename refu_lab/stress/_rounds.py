@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from refu_core._device import one_thread
-from refu_core.backbones import backbone_weights
+from refu_core.backbones import backbone_stem
 from refu_core.errors import FrameError, WeightsError
 from refu_core.frames import N_BETAS, N_STYLES
 from refu_core.garments import load_garment
+from refu_core.weights import load_card
 from refu_lab.commands.stress import StressOptions
 from refu_lab.stress import _guarantees as guarantees
 from refu_lab.stress import _invariance as invariance
@@ -217,7 +218,9 @@ def _wardrobes(options: StressOptions) -> tuple[list[Wardrobe], list[str]]:
         for name in dict.fromkeys(options.garments):
             body, folder = load_garment(name).body, None if options.weights is None else options.weights / name
             try:
-                backbone_weights(backbone, name, mode=sdf, folder=folder)
+                stem = backbone_stem(backbone, name, mode=sdf, folder=folder)
+                if stem is not None:
+                    load_card(stem)  # the weights themselves are opened by the pipelines
             except WeightsError as error:
                 left_out.append(f"{name}: no weights of {backbone} {sdf} ({error})")
             else:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import struct
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -299,3 +302,16 @@ def test_damaged_markers(at: int, new: bytes, cut: bool) -> None:
 def test_absurd_marker_counts() -> None:
     with pytest.raises(DecodeError, match="claims 4294967295 items"):
         decode_marker_array(struct.pack("<4sI", b"\0\1\0\0", 2**32 - 1) + bytes(400))
+
+
+@pytest.mark.parametrize("copied", [lambda one: pickle.loads(pickle.dumps(one)), copy.deepcopy, copy.copy])
+def test_an_encoder_can_be_sent_to_a_process(copied: Callable[[MarkerArrayEncoder], MarkerArrayEncoder]) -> None:
+    mesh = MarkerMesh("m", TRIANGLE, 3)
+    encoder = MarkerArrayEncoder([mesh], frame_id="map", axes="frame", lifetime_ns=7)
+    other = copied(encoder)
+    near, far = np.eye(3), 5 * np.eye(3)
+    wanted = encoder.encode([near], stamp_ns=1)
+    before = other.encode([near], stamp_ns=1)
+    assert encoder.encode([far], stamp_ns=2) != wanted  # nothing is shared
+    assert before == wanted
+    assert other.encode([near], stamp_ns=1) == wanted

@@ -329,6 +329,14 @@ def test_codes_of_a_basis_measure_vertices(garment: GarmentTemplate, basis: Basi
         torch.testing.assert_close(norms, rest.square().sum((1, 2)), rtol=1e-2, atol=0)
 
 
+def test_loading_a_network_asks_its_basis_for_directions_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They were computed for the network without memory, too, that a card's sizes are tried out with."""
+    asked, directions = [], BasisDecoder.directions
+    monkeypatch.setattr(BasisDecoder, "directions", lambda *given: asked.append(1) or directions(*given))
+    load_backbone("tailornet", "skirt-female")
+    assert len(asked) == 1
+
+
 @pytest.mark.parametrize("rank", [9, 40])  # of which the first 32 are stored in half precision
 @pytest.mark.parametrize("n", [1, 2, 4, 7, 16, 17])
 @pytest.mark.parametrize("n_vertices", [1, 16, 107])

@@ -36,10 +36,11 @@ from refu_core.errors import FrameError, WeightsError
 from refu_core.frames import LAGS, N_PAST
 from refu_core.metrics import CollisionChecker
 from refu_core.simulation import open_dataset
-from refu_core.training import DynamicsSettings, LoopSettings, train_dynamics
+from refu_core.training import DynamicsSettings, LoopSettings, PretrainSettings, train_dynamics
 from refu_core.training._data import output_basis, read_samples
 from refu_core.training._pretrain import tell_of
 from refu_core.weights import load_weights, weights_folder
+from refu_lab.cli import main
 from refu_lab.stress._frames import promised
 
 pytestmark = pytest.mark.usefixtures("no_curves_in_module")
@@ -513,3 +514,13 @@ def test_a_tailornet_is_wanted_first(tmp_path: Path) -> None:
     data = write_sequences(tmp_path / "sequences", count=3, n_test=1, seconds=0.5)
     with pytest.raises(WeightsError, match="no such weights"):
         train_dynamics(GARMENT, [data], tmp_path / GARMENT, quiet=True)
+
+
+def test_the_command_counts_frames_and_not_sequences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It counted for itself, and trained on thousands of frames with the settings for dozens of samples."""
+    data = write_sequences(tmp_path / "sequences", count=4, n_test=1, seconds=0.5)
+    counted, of = [], PretrainSettings.of
+    monkeypatch.setattr(PretrainSettings, "of", lambda *given, samples=0: counted.append(samples) or of(*given))
+    common = ["--backbone", "mlp", "--mode", "none", "--steps", "1", "--quiet"]
+    assert main(["train", GARMENT, "--data", str(data), "--output", str(tmp_path / GARMENT), *common]) == 0
+    assert counted == [3 * 15]

@@ -257,6 +257,9 @@ def test_what_is_placed_is_not_turned() -> None:
         (1e300 * np.eye(3), [[0, 1, 2]], r"it is 1e\+300 large and reaches to 1e\+300: wanted sizes from"),
         (1e-200 * np.eye(3), [[0, 1, 2]], "it is 1e-200 large"),
         (np.ones((3, 3)), [[0, 1, 2]], "it is 0 large"),
+        (np.ma.masked_equal(np.eye(3), 1.0), [[0, 1, 2]], "vertices that are NaN or infinite"),
+        (np.eye(3), np.ma.masked_equal([[0, 1, 2]], 2), "Cannot cast"),
+        (np.eye(3) + 0j, [[0, 1, 2]], "values of the type complex128"),
     ],
 )
 def test_meshes_that_make_no_sense_are_refused_where_they_are_made(v: Any, f: Any, wanted: str) -> None:

@@ -149,3 +149,16 @@ def test_refuses_arrays_of_another_garment() -> None:
         metrics.add(vertices, collisions, resolved=np.zeros(10, np.bool_))
     with pytest.raises(MeshError, match=r"belong to the garment's 41 vertices"):
         metrics.add(vertices[:41], collisions)
+
+
+def test_all_frames_are_of_one_garment() -> None:
+    """With a truth it was SciPy's error about the second frame; without, two garments became one row of figures."""
+    vertices, collisions = random_frame(np.random.default_rng(5))
+    metrics = GarmentMetrics(MESH.faces)
+    metrics.add(vertices, collisions, truth=vertices)
+    more = np.concatenate((vertices, vertices[:1]))
+    nothing = Collisions(np.zeros((0, 2), np.int32), np.zeros(0, np.bool_), np.zeros(N + 1, bool), np.zeros(N + 1))
+    for truth in (more, None):
+        with pytest.raises(MeshError, match=r"the garment's vertices must have the shape \(42, 3\), got \(43, 3\)"):
+            metrics.add(more, nothing, truth=truth)
+    assert metrics.summary().n_frames == 1

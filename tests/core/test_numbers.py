@@ -17,7 +17,7 @@ import msg_adapters as adapters
 from msg_adapters import BagError, EncodeError
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint_layout
-from refu_core.metrics import CollisionChecker
+from refu_core.metrics import CollisionChecker, FoldBands
 from refu_core.observation import Observer
 from refu_core.outputs import Openings, PinholeCamera, PlannerMesh, Sigma, visible
 from refu_core.realtime import PipelineOutput
@@ -84,6 +84,7 @@ TAKERS: dict[str, tuple[Callable[[], np.ndarray], Callable[[Any], Any]]] = {
         lambda value: Sigma(dressed()[0])(FRAME, dressed()[1], pose_covariance=value)[WORN],
     ),
     "markers": (_garment, _markers),
+    "bands of folds": (_garment, lambda points: FoldBands(dressed()[0].garments[WORN].mesh).split(points)),
 }
 each_taker = pytest.mark.parametrize(("given", "take"), TAKERS.values(), ids=TAKERS)
 

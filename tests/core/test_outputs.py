@@ -228,6 +228,14 @@ def test_a_planners_mesh_is_recalled_and_moves_with_the_garment() -> None:
     assert np.allclose(first.solid(rest @ turn.T + 7.0), again.solid(rest) @ turn.T + 7.0, atol=1e-9)
 
 
+def test_a_planners_mesh_is_not_that_of_other_networks(pipeline: GarmentPipeline) -> None:
+    """The cache knew a garment by its rest pose: whichever networks came first made the mesh of all."""
+    rest, skinned = SHORTS.v_template, GarmentPipeline.load([SHORTS], backbone="skinned", certify=False)
+    first, other, again = (PlannerMesh.of(one, SHORTS.name, 400).middle(rest) for one in (pipeline, skinned, pipeline))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
 def test_a_garment_that_planners_cannot_have_keeps_no_other_from_them() -> None:
     """A hundred loose pieces can't be drawn with 2,000 triangles; shorts beside them can."""
     shorts, shirt = load_garment("short-pant-male"), load_garment("tshirt-male")

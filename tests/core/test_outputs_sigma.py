@@ -64,6 +64,8 @@ def test_sigma_is_that_of_the_errors(tmp_path: Path) -> None:
         fit_sigma(garment, errors[:9], poses[:9])
     with pytest.raises(MeshError, match=r"wanted finite errors .* and poses"):
         fit_sigma(garment, errors, np.where(np.arange(300)[:, None, None] == 7, np.nan, poses))
+    with pytest.raises(MeshError, match="wanted finite errors"):
+        fit_sigma(garment, np.ma.masked_equal(errors, errors[0, 0]), poses)
 
 
 @pytest.mark.parametrize("garment", ["tshirt-male", "skirt-female"])

@@ -102,6 +102,30 @@ def test_what_was_kept_and_is_damaged_is_made_again(
     assert made
 
 
+def test_a_relative_cache_stays_where_it_was_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("REFU_CACHE", f"kept/{tmp_path.name}")
+    keep("ones", {"ones": np.ones(3)})
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    assert recall("ones", keys=("ones",)) is not None
+    keep("twos", {"twos": np.ones(3)})
+    assert not list(Path().iterdir())
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("REFU_CACHE", f"~/kept/{tmp_path.name}")  # as an env file gives it, which no shell reads
+    assert recall("twos", keys=("twos",)) is not None
+
+
+def test_a_cache_in_a_working_directory_that_was_removed_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    monkeypatch.setenv("REFU_CACHE", "first/asked/for/here")
+    assert cache_folder().is_absolute()
+
+
 def test_nowhere_to_keep_anything(fit: BodyFit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REFU_CACHE", str(tmp_path / "file" / "folder"))
     (tmp_path / "file").write_text("in the way")

@@ -22,14 +22,14 @@ import torch
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
 from refu_core._warp import Recorded
-from refu_core.body import Collider
+from refu_core.body import Collider, Surface
 from refu_core.contact import Layer, LimbMeshes, Press, Resolver, Sheet, StrainLimit, Unfold, WayOut
 from refu_core.mesh import Connectivity
 from refu_core.metrics import CollisionChecker, SelfContactDetector, SheetChecker
 from refu_core.outputs import LimbContacts
 from refu_core.realtime import Dressed, PipelineOutput
 from refu_core.realtime._frame import FrameStep
-from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf
+from refu_core.sdf import ApproxSdf, BandSdf, ExactSdf, Winding
 from refu_lab.stress._frames import everyday
 
 _GARMENTS = ("tshirt-male", "short-pant-male")
@@ -313,6 +313,7 @@ def test_what_holds_memory_of_warp_says_that_it_cannot_leave_its_process() -> No
     there = [ExactSdf(body.faces), BandSdf(body.faces), ApproxSdf(body), Resolver(body.faces, body.n_vertices)]
     checkers = [CollisionChecker(body.faces), SelfContactDetector(body.faces, body.v_template), Collider(body)]
     shorts, shirt = load_garment("short-pant-male"), load_garment("tshirt-male")
+    skin = Surface(body.v_template.double().numpy(), body.faces.int().numpy())
     sheet = Sheet(Connectivity.of(body.faces, body.n_vertices), body.v_template)
     layer = Layer(shirt.faces, shirt.v_template, shorts.faces, shorts.v_template)
     steps = [sheet, layer, layer.parting, StrainLimit(shorts.mesh, body.device), Unfold(shorts, [shirt]), WayOut(sheet)]
@@ -323,6 +324,8 @@ def test_what_holds_memory_of_warp_says_that_it_cannot_leave_its_process() -> No
         Press(shorts, limbs),
         SheetChecker(shorts.faces),
         LimbContacts(body, {"shorts": shorts}),
+        Winding(body.faces),
+        skin,
     ]
     for one in [*there, *checkers, *steps]:
         for leave in (pickle.dumps, copy.copy, copy.deepcopy):

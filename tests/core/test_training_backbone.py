@@ -323,6 +323,70 @@ def test_interrupted_it_resumes_to_the_same_weights(
     assert any(not torch.equal(t, whole[k]) for k, t in weights(tmp_path / "other").items())
 
 
+class Noisy(torch.nn.Module):
+    """A parameter whose loss is random on its device, as dropout makes it."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(4, device=device))
+
+    def forward(self, batch: Tensor) -> Tensor:
+        return (self.weight * torch.rand_like(self.weight) - batch).square().sum()
+
+
+def of_noise(stem: Path, device: str) -> Tensor:
+    """The weights after nine steps, with three checkpoints."""
+    model, settings = Noisy(device), LoopSettings(batch_size=2, check_every=3)
+    loop = loop_module.Loop(model, settings, stem, 0, torch.device(device), quiet=True)
+    loop.run(loop_module.TrainingStage("all", model, 9, (torch.ones(5, 4),)))
+    return model.weight.detach().cpu()
+
+
+def of_noise_resumed(stem: Path, device: str, patch: pytest.MonkeyPatch) -> Tensor:
+    """The same, stopped at the first checkpoint."""
+    real = loop_module.save_checkpoint
+    patch.setattr(loop_module, "save_checkpoint", lambda *args: (real(*args), pytest.fail("stopped")))
+    with pytest.raises(pytest.fail.Exception, match="stopped"):
+        of_noise(stem, device)
+    patch.setattr(loop_module, "save_checkpoint", real)
+    return of_noise(stem, device)
+
+
+@pytest.mark.usefixtures("no_curves")
+@pytest.mark.parametrize(
+    "device",
+    ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU"))],
+)
+def test_random_numbers_go_on_where_they_were(tmp_path: Path, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints had the CPU's alone: on a GPU a resumed stage drew what its first steps had drawn."""
+    assert torch.equal(of_noise_resumed(tmp_path / "parts", device, monkeypatch), of_noise(tmp_path / "whole", device))
+
+
+@pytest.mark.usefixtures("no_curves")
+def test_a_resumed_stage_sets_its_gpus_random_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    state, told = torch.arange(3), []
+    monkeypatch.setattr(loop_module, "_gpu_state", lambda _: {"gpu_rng": state})
+    monkeypatch.setattr(loop_module, "_set_gpu_state", lambda device, saved: told.append((device.type, saved.tolist())))
+    of_noise_resumed(tmp_path / "parts", "cpu", monkeypatch)
+    assert told == [("cpu", [0, 1, 2])]
+
+
+def test_a_checkpoint_has_the_random_numbers_of_its_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In place of a GPU, a generator of its own."""
+    gpu, device = torch.Generator().manual_seed(5), torch.device("cuda", 1)
+    monkeypatch.setattr(torch.cuda, "get_rng_state", lambda of: of == device and gpu.get_state())
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda state, of: of == device and gpu.set_state(state))
+    saved = loop_module._gpu_state(device)["gpu_rng"]
+    drawn = torch.rand(3, generator=gpu)
+    loop_module._set_gpu_state(device, None)  # of a checkpoint that has none
+    assert not torch.equal(torch.rand(3, generator=gpu), drawn)
+    loop_module._set_gpu_state(torch.device("cpu"), saved)
+    assert not torch.equal(torch.rand(3, generator=gpu), drawn)
+    loop_module._set_gpu_state(device, saved)
+    assert torch.equal(torch.rand(3, generator=gpu), drawn)
+    assert loop_module._gpu_state(torch.device("cpu")) == {}
+
+
 def test_low_frequency_targets_are_smoothed_garments(samples: TrainingSamples, garment: GarmentTemplate) -> None:
     from refu_core.backbones import TailorNet, build_backbone
     from refu_core.training._pretrain import low_frequency_code, pivots_of

@@ -15,6 +15,7 @@ import msg_adapters as adapters
 from refu_core import GarmentPipeline, MeshError, RefuError, Resolver, SmplFrame, load_garment
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint_layout
 from refu_core.mesh import Connectivity
+from refu_core.metrics import FoldBands
 from refu_core.outputs import Clearance, LimbContacts, PinholeCamera, PlannerMesh, Sigma, all_visible
 from refu_core.refu import repulse
 from refu_core.sdf import SdfSample
@@ -59,6 +60,8 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
         (lambda n=n: Connectivity.of(FACES, n), "wanted a number of vertices")
         for n in (math.nan, 4.5, "4", 10**30, [4])
     ),
+    (lambda: Connectivity.of(np.ma.masked_equal(FACES, 3)), "faces must be integers"),
+    (lambda: FoldBands(Connectivity.of(FACES)).split(np.ones((5, 3))), r"shape \(4, \.\.\.\), got \(5, 3\)"),
     (lambda: Resolver(FACES, "4"), "wanted a number of vertices"),  # type: ignore[arg-type]
     *(
         (lambda n=n: adapters.MarkerMesh("a", FACES, n), "a: wanted a number of vertices")

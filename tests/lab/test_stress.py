@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 
 from refu_core import GarmentPipeline, SmplFrame
+from refu_core.modes import PAPER_GARMENTS
 from refu_core.realtime import GarmentMesh, PipelineOutput
+from refu_core.weights import _files
 from refu_lab.cli import main
+from refu_lab.commands.stress import StressOptions
 from refu_lab.stress._guarantees import _above
-from refu_lab.stress._rounds import CHECKS, length
+from refu_lab.stress._rounds import CHECKS, _wardrobes, length
 from refu_lab.stress._soak import SoakResult, resident_mb, soak
 from refu_lab.stress._trial import (
     Check,
@@ -325,6 +328,16 @@ def test_bad_input_is_one_line(arguments: list[str], wanted: str, capsys: pytest
     error = capsys.readouterr().err
     assert wanted in error
     assert error.count("\n") == 1
+
+
+def test_only_pipelines_open_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    opened: list[Path] = []
+    monkeypatch.setattr(_files, "_read_tensors", lambda path, _: opened.append(path) or {})
+    wardrobes, left_out = _wardrobes(StressOptions())
+    assert {name for one in wardrobes for name in one.garments} == set(PAPER_GARMENTS)
+    assert (opened, left_out) == ([], [])
+    with pytest.raises(StressError, match="no such weights"):
+        _wardrobes(StressOptions(weights=tmp_path, backbone="tailornet"))
 
 
 def test_the_closest_points_of_a_sheet() -> None:
