@@ -237,7 +237,7 @@ class Recorder:
             self._unsynced = None
         except Exception as error:  # whatever it is, it ends only the recording
             with self._changed:
-                self._error = str(error) or type(error).__name__
+                self._error = printable(error) or type(error).__name__
                 kept = self._bag.n_whole
                 self._dropped += self._written - kept + (message not in (None, _SYNC)) + len(self._queue)
                 self._written = kept
@@ -312,7 +312,7 @@ class RunningRecording:
         try:
             self.start(path)
         except BagError as error:
-            self._error = printable(error)
+            self._error = str(error)
 
     def switch(self, path: str, *, on: bool) -> tuple[str, str]:
         """Starts or stops on request; returns what has been done, and the bag. Raises `BagError` where it can't."""
@@ -334,8 +334,8 @@ class RunningRecording:
         recorder, self._recorder, self._error = self._recorder, None, ""
         if recorder is not None:
             recorder.stop()
-            if error := recorder.state().error:  # an error that has ended it already
-                self._error = printable(error)
+            if error := recorder.state().error:  # one that has ended it already
+                self._error = error
             self._closing = [*(one for one in self._closing if not one.finished), recorder]
 
     def end(self) -> None:
@@ -351,7 +351,7 @@ class RunningRecording:
     def state(self) -> tuple[RecorderState | None, str]:
         """The recording's state (None: nothing is recorded), and why it failed, or empty."""
         state = None if self._recorder is None else self._recorder.state()
-        return state, self._error if state is None else printable(state.error)
+        return state, self._error if state is None else state.error
 
     def close(self) -> None:
         """Waits until everything is in the files."""
@@ -361,7 +361,7 @@ class RunningRecording:
 
     def _ended(self, state: RecorderState) -> None:
         if state.error:
-            self._error = printable(state.error)
+            self._error = state.error
             self._logger.error(printable(f"recorded up to {state.written} messages, then: {state.error}"))
         else:
             self._logger.info(printable(f"recorded {state.written} messages to {state.path}"))

@@ -21,7 +21,6 @@ from msg_adapters.bags._mcap import MAX_CHUNK_BYTES, Budget, DamageError, Stored
 from msg_adapters.bags._metadata import TopicInfo
 from msg_adapters.definitions import full_type_name
 from msg_adapters.errors import BagError
-from refu_core.errors import printable
 
 MAGIC = b"SQLite format 3\x00"
 _NEEDED = {"topics": {"id", "name", "type", "serialization_format"}, "messages": {"topic_id", "timestamp", "data"}}
@@ -47,7 +46,7 @@ class SqliteFile:
                 self._columns = {name: _columns(database, name) for name in _NEEDED}
                 self._definitions = _columns(database, "message_definitions")
         except DamageError as damage:
-            raise BagError(printable(f"{path}: {damage}")) from damage
+            raise BagError(f"{path}: {damage}") from damage
         for name, needed in _NEEDED.items():
             if missing := needed - self._columns[name]:
                 raise BagError(f"{path}: not a bag: wanted rosbag2's table {name!r} with {', '.join(sorted(missing))}")

@@ -69,14 +69,6 @@ def _garment_names(one: DressedPerson) -> list[str]:
     return [garment_namespace(name, one.person) for name in one.fittings.names]
 
 
-def _body_of(one: DressedPerson) -> MarkerMesh:
-    return MarkerMesh(garment_namespace(BODY, one.person), *one.fittings.body, color=SKIN)
-
-
-def _rim_names(one: DressedPerson) -> list[str]:
-    return [rim.name for rim in _rims_of(one)]
-
-
 def _encode_rims(worn: Sequence[DressedPerson], moment: Moment, _: Layouts) -> bytes:
     rims = [rim for one in worn for rim in _rims_of(one)]
     return _meshes.encode_rims(rims, frame_id=moment.frame_id, lifetime_ns=moment.lifetime_ns)
@@ -137,10 +129,6 @@ def _encode_polygon(one: DressedPerson, place: tuple[str, int], moment: Moment) 
     return _meshes.encode_polygon(ring, stamp_ns=one.stamp_ns, frame_id=moment.frame_id)
 
 
-def _mesh_places(fittings: Fittings) -> list[tuple[str, str]]:
-    return [(f"mesh/{_token(name)}", name) for name in fittings.names]
-
-
 def _encode_mesh(one: DressedPerson, name: str, moment: Moment) -> bytes:  # noqa: ARG001 - a mesh has no header
     vertices, faces = one.solid(name)
     return _meshes.encode_mesh(vertices + one.offset, faces)
@@ -151,16 +139,23 @@ def make_outputs(*, tf: bool = False) -> list[Output]:
     garments = _markers(
         lambda one: [_mesh_of(one, name) for name in one.fittings.names], lambda one: [*one.vertices.values()]
     )
-    body = _markers(lambda one: [_body_of(one)], lambda one: [one.body])
+    body = _markers(
+        lambda one: [MarkerMesh(garment_namespace(BODY, one.person), *one.fittings.body, color=SKIN)],
+        lambda one: [one.body],
+    )
     table: list[Output] = [
         Together(GARMENTS, MARKER_ARRAY, _garment_names, garments, _delete_markers),
         Together(BODY, MARKER_ARRAY, lambda one: [garment_namespace(BODY, one.person)], body, _delete_markers),
-        Together(OPENINGS, MARKER_ARRAY, _rim_names, _encode_rims, _delete_markers),
+        Together(
+            OPENINGS, MARKER_ARRAY, lambda one: [rim.name for rim in _rims_of(one)], _encode_rims, _delete_markers
+        ),
         Together("scene", _meshes.SCENE_UPDATE, _garment_names, _encode_scene, _delete_entities),
         Apart(POINT_CLOUD, lambda _: [("points", None)], partial(_encode_points, Layouts())),
         Apart(DIAGNOSTIC_ARRAY, lambda _: [("contacts", None)], _encode_contacts),
         Apart(_meshes.POLYGON, _opening_places, _encode_polygon),
-        Apart(_meshes.MESH, _mesh_places, _encode_mesh, slow=True),
+        Apart(
+            _meshes.MESH, lambda worn: [(f"mesh/{_token(name)}", name) for name in worn.names], _encode_mesh, slow=True
+        ),
         Obstacles(),
     ]
     if tf:

@@ -85,6 +85,13 @@ class Content:
         self._made[id(value)] = value, array  # the value is kept, so that its id is never reused
         return array
 
+    def shapes(self, node: Mapping[Key, Any], names: Sequence[str]) -> list[tuple[int, ...]]:
+        """The shapes of a mapping's arrays of these names; empty where one of them is no array."""
+        try:
+            return [self.array(node[name]).shape for name in names]
+        except ValueError:
+            return []
+
     def column(self, value: Any) -> NDArray[Any] | None:
         """The array of numbers or words that a value stands for, of one axis or two; None for anything else.
 

@@ -189,13 +189,11 @@ def _renamed(node: Mapping[Key, Any], names: Mapping[Key, str]) -> Mapping[Key, 
 
 def _is_shaped(content: Content, layout: table.Layout, node: Mapping[Key, Any]) -> bool:
     """Whether the arrays of a layout are shaped like poses, of one person or several."""
-    try:
-        shapes = [content.array(node[name]).shape for name in layout.pose]
-    except ValueError:
-        return False
+    shapes = content.shapes(node, layout.pose)
     each = zip(shapes, layout.joints, strict=True)
-    return layout.is_time_last or all(
-        any(is_one_frame(shape[axes:], counts) for axes in range(min(3, len(shape)))) for shape, counts in each
+    return bool(shapes) and (
+        layout.is_time_last
+        or all(any(is_one_frame(shape[axes:], counts) for axes in range(min(3, len(shape)))) for shape, counts in each)
     )
 
 

@@ -96,13 +96,10 @@ def _n_rows(content: Content, node: Mapping[Key, Any]) -> int:
     layout = next((one for one in table.LAYOUTS if one.is_in(node)), None)
     if layout is None or layout.is_time_last:
         return 0
-    try:
-        shapes = [content.array(node[name]).shape for name in layout.pose]
-    except ValueError:
-        return 0
-    n = shapes[0][0] if len(shapes[0]) > 1 else 0
+    shapes = content.shapes(node, layout.pose)
+    n = shapes[0][0] if shapes and len(shapes[0]) > 1 else 0
     each = zip(shapes, layout.joints, strict=True)
-    return n if all(shape[:1] == (n,) and is_one_frame(shape[1:], counts) for shape, counts in each) else 0
+    return n if n and all(shape[:1] == (n,) and is_one_frame(shape[1:], counts) for shape, counts in each) else 0
 
 
 def _words(content: Content, node: Mapping[Key, Any], names: Sequence[str], n: int) -> Sequence[Key]:

@@ -147,11 +147,8 @@ def _layout_of(content: Content, node: Mapping[Key, Any]) -> table.Layout | None
     for layout in table.LAYOUTS:
         if layout.is_time_last or not layout.is_in(node):
             continue
-        try:
-            shapes = [content.array(node[name]).shape for name in layout.pose]
-        except ValueError:
-            continue
-        if all(map(is_one_frame, shapes, layout.joints)):
+        shapes = content.shapes(node, layout.pose)
+        if shapes and all(map(is_one_frame, shapes, layout.joints)):
             return layout
     return None
 

@@ -27,7 +27,7 @@ from refu_core._device import checked_device
 from refu_core.errors import SimulationError
 from refu_core.frames import N_BETAS
 from refu_core.simulation._cloth import F32, ClothCut, CourseStep
-from refu_core.simulation._drape import CANONICAL_POSE, Course, DrapeSettings, sent
+from refu_core.simulation._drape import CANONICAL_POSE, Course, sent
 from refu_core.simulation._lanes import ClothLanes
 from refu_core.simulation._store import CAUSES, GIVEN_UP
 from refu_core.simulation._worker import SlotSimulator
@@ -42,9 +42,8 @@ class _Courses:
 
     cut: ClothCut
     courses: list[Course]
-    start: F32 | None = None
+    first: tuple[F32, Course] | None
     """For the first attempts, the garment as it is put on, and the way to the canonical drape."""
-    canonical: Course | None = None
 
 
 _AHEAD = 2
@@ -66,12 +65,9 @@ def _prepare(attempts: list[_Attempt], is_first: bool) -> _Courses:
     betas, style = plan.style_shape(plan.pair_of(attempts[0][0]))
     canonical = draper.canonical_course(betas) if is_first else None
     body = draper.bodies(CANONICAL_POSE[None], betas)[0]
-    return _Courses(
-        draper.cut(betas, style),
-        [draper.course(_simulator.tried(*attempt)[0], betas, body) for attempt in attempts],
-        None if canonical is None else draper.dressed(betas, style, canonical),
-        canonical,
-    )
+    cut = draper.cut(betas, style)
+    courses = [draper.course(_simulator.tried(*attempt)[0], betas, body) for attempt in attempts]
+    return _Courses(cut, courses, None if canonical is None else (draper.dressed(betas, style, canonical), canonical))
 
 
 def _judge(attempt: _Attempt, cut: ClothCut, positions: F32, speed: float) -> tuple[str | None, dict[str, Any]]:
@@ -135,20 +131,16 @@ class LaneEngine:
         spawning = get_context("spawn")  # a fork of a process that has a GPU can't use torch
         with TemporaryDirectory() as folder:
             # In a file: what doesn't fit into a pipe would keep each process from being started beside the last.
-            sent = Path(folder) / "make.pickle"
-            sent.write_bytes(pickle.dumps(make))
-            with ProcessPoolExecutor(self._jobs, spawning, _begin, (sent,)) as pool:
-                yield from self._blocks(simulator, pool, tasks)
-
-    def _blocks(
-        self, simulator: SlotSimulator, pool: ProcessPoolExecutor, tasks: Sequence[list[int]]
-    ) -> Iterator[tuple[int, list[dict[str, Any]]]]:
-        try:
-            yield from _Run(simulator, pool, tasks, self._lanes, self._device).blocks()
-        except BrokenProcessPool as error:
-            raise SimulationError("a helping process was killed (out of memory?): run the same again") from error
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            made = Path(folder) / "make.pickle"
+            made.write_bytes(pickle.dumps(make))
+            with ProcessPoolExecutor(self._jobs, spawning, _begin, (made,)) as pool:
+                try:
+                    yield from _Run(simulator, pool, tasks, self._lanes, self._device).blocks()
+                except BrokenProcessPool as error:
+                    msg = "a helping process was killed (out of memory?): run the same again"
+                    raise SimulationError(msg) from error
+                finally:
+                    pool.shutdown(wait=False, cancel_futures=True)
 
 
 class _Run:
@@ -162,7 +154,7 @@ class _Run:
         lanes: int,
         device: torch.device,
     ) -> None:
-        draper, settings = simulator.draper, simulator.settings
+        draper, how = simulator.draper, simulator.settings.drape
         self._simulator, self._pool, self._tasks = simulator, pool, tasks
         self._lanes = ClothLanes(
             draper.topology,
@@ -170,9 +162,9 @@ class _Run:
             draper.body.faces.numpy(),
             anchored=draper.waist.astype(np.int32),
             lanes=lanes,
-            most_bodies=_most_bodies(settings.drape),
+            most_bodies=1 + max(how.lower_frames, how.move_frames[1]),
             device=device,
-            settings=settings.drape.cloth,
+            settings=how.cloth,
         )
         self._jobs: list[_Job | None] = [None] * lanes
         self._ready: deque[_Job] = deque()
@@ -206,11 +198,11 @@ class _Run:
     def _ask_for(self, block: _Block, attempts: list[_Attempt], *, is_first: bool = False) -> None:
         def take(prepared: _Courses) -> None:
             block.waiting += [(prepared.cut, *one) for one in zip(prepared.courses, attempts, strict=True)]
-            if prepared.canonical is not None and prepared.start is not None:
-                block.drape = prepared.start
-                self._ready.append(_Job(block, prepared.cut, prepared.canonical, None))
-            else:
+            if prepared.first is None:
                 self._release(block)
+            else:
+                block.drape, canonical = prepared.first
+                self._ready.append(_Job(block, prepared.cut, canonical, None))
 
         self._ahead += len(attempts)
         self._asked[self._pool.submit(_prepare, attempts, is_first)] = take
@@ -272,7 +264,3 @@ class _Run:
         done, _ = wait(self._asked, timeout=timeout, return_when=FIRST_COMPLETED)
         for future in done:
             self._asked.pop(future)(future.result())
-
-
-def _most_bodies(settings: DrapeSettings) -> int:
-    return 1 + max(settings.lower_frames, settings.move_frames[1])

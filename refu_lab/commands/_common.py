@@ -8,7 +8,7 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -118,25 +118,22 @@ def name_or_path(text: str) -> str:
     return expanded(word(text))
 
 
-def _output(wanted: str, *kinds: Callable[[int], bool]) -> Callable[[str], Path]:
-    """A parser of the path of something to write; whatever exists there must be of one of these kinds."""
-
-    def parse(text: str) -> Path:
-        found = in_path(text)
-        try:
-            is_right = any(is_kind(found.stat().st_mode) for is_kind in kinds)
-        except FileNotFoundError:
-            is_right = True
-        except OSError as error:
-            raise argparse.ArgumentTypeError(f"{printable(text)} can't be written: {error.strerror}") from error
-        if not is_right or not found.name:
-            raise argparse.ArgumentTypeError(f"wanted {wanted} to write, or a new one, not {printable(text)}")
-        return found
-
-    return parse
+def _output(wanted: str, kinds: Sequence[Callable[[int], bool]], text: str) -> Path:
+    """The path of something to write; whatever exists there must be of one of these kinds."""
+    found = in_path(text)
+    try:
+        is_right = any(is_kind(found.stat().st_mode) for is_kind in kinds)
+    except FileNotFoundError:
+        is_right = True
+    except OSError as error:
+        raise argparse.ArgumentTypeError(f"{printable(text)} can't be written: {error.strerror}") from error
+    if not is_right or not found.name:
+        raise argparse.ArgumentTypeError(f"wanted {wanted} to write, or a new one, not {printable(text)}")
+    return found
 
 
-out_file, out_folder = _output("a file", stat.S_ISREG), _output("a folder", stat.S_ISDIR)
+out_file = partial(_output, "a file", [stat.S_ISREG])
+out_folder = partial(_output, "a folder", [stat.S_ISDIR])
 
 
 def out_picture(text: str) -> Path:
@@ -153,7 +150,7 @@ def out_bag(text: str) -> Path:
     if (path.suffix[1:].isalpha() or path.suffix == ".db3") and path.suffix != ".mcap" and not path.is_dir():
         msg = f"bags are written as NAME.mcap, or as a folder, whose name has no {path.suffix}; got {printable(text)}"
         raise argparse.ArgumentTypeError(msg)
-    return _output("a file or a folder", stat.S_ISREG, stat.S_ISDIR)(text)
+    return _output("a file or a folder", [stat.S_ISREG, stat.S_ISDIR], text)
 
 
 def word(text: str) -> str:

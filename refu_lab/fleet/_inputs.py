@@ -13,7 +13,6 @@ from typing import Any
 
 from msg_adapters import BAG_SUFFIXES
 from refu_core import RefuError
-from refu_core.errors import printable
 from refu_core.recordings import SUFFIXES as MOTION_SUFFIXES
 from refu_core.recordings import is_named_as_motion
 from refu_lab.fleet._storage import filesystem, is_url
@@ -133,7 +132,7 @@ def _place(source: str) -> PurePosixPath:
         return PurePosixPath(path if ".." not in path.parts else Path(os.path.realpath(path.parent), path.name))
     place = PurePosixPath(source.partition("://")[2])
     if ".." in place.parts:
-        raise RefuError(printable(f"{source}: wanted a name without '..', which leads out of a folder: rename it"))
+        raise RefuError(f"{source}: wanted a name without '..', which leads out of a folder: rename it")
     return place
 
 

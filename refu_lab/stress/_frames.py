@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,21 +51,12 @@ def everyday(rng: np.random.Generator) -> SmplFrame:
     )
 
 
-def _directions(rng: np.random.Generator, lengths: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Rotation vectors of these lengths (24,) in random directions, shape (24, 3)."""
+def _turned(rng: np.random.Generator, *, by: Sequence[float], jitter: float = 0.0) -> SmplFrame:
+    """Each joint turns by one of these angles, give or take `jitter` [rad], about a random axis."""
+    angles = rng.choice(by, N_JOINTS) + jitter * rng.normal(size=N_JOINTS)
     axes = rng.normal(size=(N_JOINTS, 3))
-    unit: NDArray[np.float64] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    return unit * lengths[:, None]
-
-
-def _one_of(*lengths: float, jitter: float = 0.0) -> Draw:
-    """Draws frames in which each joint turns by one of these angles, give or take `jitter` [rad]."""
-
-    def draw(rng: np.random.Generator) -> SmplFrame:
-        angles = rng.choice(lengths, N_JOINTS) + jitter * rng.normal(size=N_JOINTS)
-        return frame_of(_directions(rng, angles), betas=rng.normal(0, 1, N_BETAS))
-
-    return draw
+    pose = axes / np.linalg.norm(axes, axis=1, keepdims=True) * angles[:, None]
+    return frame_of(pose, betas=rng.normal(0, 1, N_BETAS))
 
 
 def _wrapped(rng: np.random.Generator) -> SmplFrame:
@@ -75,18 +67,12 @@ def _wrapped(rng: np.random.Generator) -> SmplFrame:
     return frame_of(pose * (1 + 2 * np.pi * turns / angle), betas=rng.normal(0, 1, N_BETAS))
 
 
-def _betas(size: float) -> Draw:
-    def draw(rng: np.random.Generator) -> SmplFrame:
-        return frame_of(everyday_pose(rng), betas=rng.choice((-size, size), N_BETAS) * rng.random(N_BETAS) ** 0.1)
-
-    return draw
+def _betas(rng: np.random.Generator, *, size: float) -> SmplFrame:
+    return frame_of(everyday_pose(rng), betas=rng.choice((-size, size), N_BETAS) * rng.random(N_BETAS) ** 0.1)
 
 
-def _styles(size: float) -> Draw:
-    def draw(rng: np.random.Generator) -> SmplFrame:
-        return frame_of(everyday_pose(rng), style=rng.uniform(-size, size, N_STYLES))
-
-    return draw
+def _styles(rng: np.random.Generator, *, size: float) -> SmplFrame:
+    return frame_of(everyday_pose(rng), style=rng.uniform(-size, size, N_STYLES))
 
 
 def _far(rng: np.random.Generator) -> SmplFrame:
@@ -143,17 +129,17 @@ def promised(rng: np.random.Generator) -> SmplFrame:
 FRAMES: Mapping[str, Draw] = {
     "everyday": everyday,
     "any rotation of any joint": _anything,
-    "half a turn, give or take 1e-6": _one_of(np.pi, 2 * np.pi, 3 * np.pi, jitter=1e-6),
+    "half a turn, give or take 1e-6": partial(_turned, by=(np.pi, 2 * np.pi, 3 * np.pi), jitter=1e-6),
     "angles beyond a turn": _wrapped,
-    "angles of 0, 1e-12, 1e-4 and where the series begins": _one_of(
-        0.0, 1e-30, 1e-12, 1e-4, _SERIES_SWITCH, jitter=1e-6
+    "angles of 0, 1e-12, 1e-4 and where the series begins": partial(
+        _turned, by=(0.0, 1e-30, 1e-12, 1e-4, _SERIES_SWITCH), jitter=1e-6
     ),
-    "angles of 1e3": _one_of(1e3, 300.0, 30.0),
+    "angles of 1e3": partial(_turned, by=(1e3, 300.0, 30.0)),
     "denormals": _denormal,
-    "betas of 5": _betas(5.0),
-    "betas of 50": _betas(50.0),
-    "styles of 5": _styles(5.0),
-    "styles of 50": _styles(50.0),
+    "betas of 5": partial(_betas, size=5.0),
+    "betas of 50": partial(_betas, size=50.0),
+    "styles of 5": partial(_styles, size=5.0),
+    "styles of 50": partial(_styles, size=50.0),
     "translations up to 1e7 m": _far,
     "limbs through the trunk": _self_penetrating,
     "absurd": _absurd,

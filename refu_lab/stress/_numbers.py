@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import torch
@@ -103,13 +104,10 @@ def _medial(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
     return halfway
 
 
-def _hair(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
-    """Points a hair's breadth off the skin on either side, down to less than float32 resolves."""
-    return _on_faces(vertices, faces, rng) + rng.normal(size=(_POINTS, 3)) * 10.0 ** rng.uniform(-40, -4, (_POINTS, 1))
-
-
-def _far(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
-    return _on_faces(vertices, faces, rng) + rng.normal(size=(_POINTS, 3)) * 10.0 ** rng.uniform(-1, 5, (_POINTS, 1))
+def _off(vertices: F32, faces: I64, rng: np.random.Generator, *, least: float, most: float) -> F64:
+    """Points off the skin on either side, by something between these powers of ten [m]."""
+    on, off = _on_faces(vertices, faces, rng), rng.normal(size=(_POINTS, 3))
+    return on + off * 10.0 ** rng.uniform(least, most, (_POINTS, 1))
 
 
 def _without_area(vertices: F32, faces: I64, rng: np.random.Generator) -> F64:
@@ -125,36 +123,31 @@ POINTS: dict[str, Place] = {
     "on faces": _on_faces,
     "on edges and vertices": _on_edges,
     "on the medial axis": _medial,
-    "a hair's breadth off": _hair,
-    "far away": _far,
+    "a hair's breadth off": partial(_off, least=-40, most=-4),  # down to less than float32 resolves
+    "far away": partial(_off, least=-1, most=5),
     "faces without area": _without_area,
 }
 
 
-def distances(place: Place) -> Callable[[Subject, Trial], Iterator[Measurement]]:
-    """A check that measures all signed distances at such points."""
-
-    def measure(subject: Subject, trial: Trial) -> Iterator[Measurement]:
-        """Compares distances with those to all triangles in float64; the approximate one must not be smaller."""
-        rng = np.random.default_rng(trial.seed)
-        body, frame = subject.pipeline.body, trial.frames[0]
-        with torch.no_grad():
-            vertices = body(frame.pose[None], frame.betas[None]).vertices[0].numpy()
-        faces = body.faces.numpy()
-        points = place(vertices, faces, rng).astype(np.float32)
-        wanted = distance_to_mesh(points, vertices, faces)
-        for name, sdf in subject.distances.items():
-            sdf.update(torch.from_numpy(vertices))
-            sample = sdf.query(torch.from_numpy(points))
-            distance, gradient = sample.distance.double().abs().numpy(), sample.gradient.double().numpy()
-            error = wanted - distance
-            error = np.maximum(error, 0) if name == "approx" else np.abs(error)
-            is_unit = np.abs(np.linalg.norm(gradient, axis=1) - 1) <= _UNIT
-            yield Measurement(
-                nan=n_not_finite(distance, gradient),
-                deviation=float((error / np.maximum(1, wanted)).max()),
-                limit=_DISTANCE_ROUNDING,
-                faults=() if is_unit.all() else (f"{name}: a gradient isn't of unit length",),
-            )
-
-    return measure
+def distances(subject: Subject, trial: Trial, *, place: Place) -> Iterator[Measurement]:
+    """Compares distances with those to all triangles in float64; the approximate one must not be smaller."""
+    rng = np.random.default_rng(trial.seed)
+    body, frame = subject.pipeline.body, trial.frames[0]
+    with torch.no_grad():
+        vertices = body(frame.pose[None], frame.betas[None]).vertices[0].numpy()
+    faces = body.faces.numpy()
+    points = place(vertices, faces, rng).astype(np.float32)
+    wanted = distance_to_mesh(points, vertices, faces)
+    for name, sdf in subject.distances.items():
+        sdf.update(torch.from_numpy(vertices))
+        sample = sdf.query(torch.from_numpy(points))
+        distance, gradient = sample.distance.double().abs().numpy(), sample.gradient.double().numpy()
+        error = wanted - distance
+        error = np.maximum(error, 0) if name == "approx" else np.abs(error)
+        is_unit = np.abs(np.linalg.norm(gradient, axis=1) - 1) <= _UNIT
+        yield Measurement(
+            nan=n_not_finite(distance, gradient),
+            deviation=float((error / np.maximum(1, wanted)).max()),
+            limit=_DISTANCE_ROUNDING,
+            faults=() if is_unit.all() else (f"{name}: a gradient isn't of unit length",),
+        )
