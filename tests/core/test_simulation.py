@@ -559,6 +559,24 @@ def test_postures_have_their_share_and_are_held_as_others_would() -> None:
             assert min(np.abs(bent - wanted).max(), np.abs(bent[::-1] - wanted).max()) < np.radians(45)
 
 
+def test_acrobats_tilt_in_all_directions_and_spread_their_legs() -> None:
+    """As far as hips and knees go, not farther, and never head down."""
+    plan = SamplePlan(GARMENT, 400, recorded_share=0.0, acrobatic_share=1.0)
+    poses = np.array([plan.pose(slot, 0, [])[0] for slot in range(400)])
+    up = Rotation.from_rotvec(poses[:, 0]).inv().apply([0.0, 1.0, 0.0])
+    assert up[:, 1].min() >= -0.5 - 1e-5
+    assert min(-up[:, [0, 2]].min(), up[:, [0, 2]].max(), up[:, 1].max()) > 0.95, "belly, back, both sides, upright"
+    left, right = poses[:, 1], poses[:, 2] * [1, -1, -1]
+    for hip in (left, right):
+        assert np.all(hip >= np.radians([-125, -25, -15]) - 1e-6)
+        assert np.all(hip <= np.radians([40, 60, 65]) + 1e-6)
+        assert np.ptp(hip[:, 0]) > np.radians(140)
+    mixed = SamplePlan(GARMENT, 400, recorded_share=0.0, posture_share=0.3, acrobatic_share=0.4)
+    acrobats = [np.array_equal(mixed.pose(slot, 0, [])[0][[1, 2]], poses[slot][[1, 2]]) for slot in range(400)]
+    assert not any(acrobats[slot] for slot in range(400) if mixed.pose(slot, 0, [])[2] >= 0)
+    assert np.mean(acrobats) == pytest.approx(0.4, abs=0.1)
+
+
 def test_a_plan_without_postures_is_as_it_was() -> None:
     """Weights say which plan they were trained on: its samples can be simulated again."""
     old, new = SamplePlan(GARMENT, 30), SamplePlan(GARMENT, 30, posture_share=0.0)
@@ -585,7 +603,9 @@ def test_postures_that_are_none_are_refused(named: object) -> None:
         SamplePlan(GARMENT, 10, postures=named)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("shares", [{"posture_share": -0.1}, {"recorded_share": 0.7, "posture_share": 0.4}])
+@pytest.mark.parametrize(
+    "shares", [{"posture_share": -0.1}, {"recorded_share": 0.7, "posture_share": 0.4}, {"acrobatic_share": 0.5}]
+)
 def test_shares_that_are_no_shares_are_refused(shares: dict[str, float]) -> None:
     with pytest.raises(SimulationError, match="shares"):
         SamplePlan(GARMENT, 10, **shares)  # type: ignore[arg-type]
