@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from refu_core import RefuError
-from refu_core._files import expanded
+from refu_core._files import check_no_dead_link, expanded
 from refu_core.errors import printable
 from refu_core.modes import BetasSource
 from refu_core.options import Spec, setting, specs_of
@@ -275,6 +275,7 @@ def check_writable(path: Path) -> None:
     """
     folder = path.absolute() if path.is_dir() else path.absolute().parent
     while not folder.exists():
+        check_no_dead_link(folder, error=RefuError)
         folder = folder.parent
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise RefuError(f"{path}: can't be written, {folder} is not a writable folder")

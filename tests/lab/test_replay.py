@@ -515,6 +515,18 @@ def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert_one_line(code, capsys.readouterr().err, "link.mcap")
 
 
+@pytest.mark.parametrize("option", ["--output", "--report", "--json"])
+def test_a_link_to_a_disk_that_is_not_there_is_said_at_once(
+    option: str, small_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was said to exist, and of a report only once all frames had been evaluated."""
+    (tmp_path / "usb").symlink_to(tmp_path / "unmounted")
+    code = run(small_bag, "--garments", "short-pant-male", option, tmp_path / "usb" / "out")
+    output = capsys.readouterr()
+    assert_one_line(code, output.err, f"a link to {tmp_path / 'unmounted'}, which isn't there")
+    assert output.out == ""
+
+
 def test_a_bag_directory_is_not_written_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = write_bag(tmp_path / "given", motion(2))
     (file,) = given.glob("*.mcap")
