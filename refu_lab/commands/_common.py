@@ -16,7 +16,7 @@ from typing import Any, NoReturn, TypeVar
 
 from refu_core import RefuError
 from refu_core._files import check_no_dead_link, expanded
-from refu_core.errors import printable
+from refu_core.errors import escaped, printable
 from refu_core.modes import BetasSource
 from refu_core.options import Spec, setting, specs_of
 from refu_core.recordings import AXES
@@ -303,5 +303,6 @@ def tell(args: argparse.Namespace, text: str, content: dict[str, Any], *, code: 
     """Writes the result as JSON if that was asked for, prints its text, and returns the exit code."""
     if args.json is not None:
         write_json(args.json, content)
-    print(text)  # last: its reader may be gone (| head)
+    # Names of files and topics may be anybody's. Last: its reader may be gone (| head)
+    print("\n".join(map(escaped, text.split("\n"))))
     return code

@@ -21,6 +21,7 @@ import igl
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
@@ -103,6 +104,21 @@ def test_times_of_receipt_that_leap_are_said(late_s: list[float], said: str | No
     warnings = [text for text in replay(options).warnings if "receipt" in text]
     assert len(warnings) == (said is not None)
     assert said is None or said in warnings[0]
+
+
+def test_nothing_that_a_bag_holds_controls_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A topic could colour the terminal, and write lines of its own."""
+    path, topic, kind = tmp_path / "bag\x1b[31m.mcap", "/\x1b]0;owned\x07\nskipped 7 x", "sensor_msgs/msg/JointState"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        number = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b""))
+        writer.add_message(number, 1, adapters.encoder_for("joint_state")(motion(1)[0]), 1)
+        writer.finish()
+    assert run(path, "--garments", "short-pant-male", "--no-evaluate") == 0
+    printed = capsys.readouterr().out
+    assert all(line.isprintable() for line in printed.splitlines())
+    assert not any(line.startswith("skipped") for line in printed.splitlines())
 
 
 def test_as_many_garments_as_frames_and_stamps_kept(small_bag: Path, tmp_path: Path) -> None:
