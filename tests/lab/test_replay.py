@@ -106,6 +106,14 @@ def test_times_of_receipt_that_leap_are_said(late_s: list[float], said: str | No
     assert said is None or said in warnings[0]
 
 
+def test_stamps_that_go_back_now_and_then_are_said(tmp_path: Path) -> None:
+    """Of parts out of order nothing was said as long as most frames were newer than the ones before."""
+    frames = motion(8)
+    bag = write_bag(tmp_path / "parts.mcap", [*frames[4:], *frames[:4]])
+    warnings = replay(ReplayOptions(input=bag, garments=["short-pant-male"], evaluate=False)).warnings
+    assert any("stamps go back in 1 of 8 frames" in text for text in warnings)
+
+
 def test_nothing_that_a_bag_holds_controls_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A topic could colour the terminal, and write lines of its own."""
     path, topic, kind = tmp_path / "bag\x1b[31m.mcap", "/\x1b]0;owned\x07\nskipped 7 x", "sensor_msgs/msg/JointState"
