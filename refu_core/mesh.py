@@ -135,7 +135,7 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
 
     Raises `MeshError` unless they are integers of that shape below `n_vertices`, three different ones per face.
     """
-    array = np.asarray(faces.cpu() if hasattr(faces, "cpu") else faces)
+    array = np.asarray(faces.detach().cpu() if hasattr(faces, "detach") else faces)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":
         raise MeshError(f"faces must be integers of shape (F, 3), got {array.dtype} of shape {array.shape}")
     low, high = int(array.min()), int(array.max())
