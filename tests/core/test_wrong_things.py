@@ -84,6 +84,10 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: Proportions.of_body("male"), "wanted a body .*, got str"),
     (lambda: meshes_of(FRAME, pipeline()(FRAME)), "wanted a GarmentPipeline, got SmplFrame"),  # type: ignore[arg-type]
     (lambda: ExactSdf(torch.zeros(4, 3, requires_grad=True)), "faces must be integers"),
+    *(
+        (lambda n=n: GarmentPipeline.load([WORN], **{n: "false"}), f"wanted {n} as True or False, got str")  # type: ignore[arg-type]
+        for n in ("graph", "certify", "collider")
+    ),
     *((lambda n=n: PlannerMesh(load_garment(WORN), n), "triangles or more") for n in (math.nan, math.inf)),
     *((lambda n=n: _wide(n), "width.*number of pixels") for n in (None, math.nan, math.inf, 0, np.ones(2))),
 ]
