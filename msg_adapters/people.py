@@ -159,6 +159,8 @@ class Track:
             found["stamps"] = f"stamps don't advance in {n_still} of {len(rows)} frames: does the sender's clock run?"
         elif len(steps) and not _SHORTEST_S <= (step := float(np.median(steps))) <= _LONGEST_S:
             found["stamps"] = f"frames are {step:.2g} s apart by their stamps: are those in another unit?"
+        elif self._last_ns is not None and (n_back := int((steps < 0).sum())):
+            found["stamps"] = f"stamps go back in {n_back} of {len(rows)} frames: {_BACK}"
         if self._n_leaps:
             times = f"times of receipt leap in {self._n_leaps} of {len(rows)} frames, at first by {self._leap_s:+.1f} s"
             found["receipt"] = f"{times}, and stamps don't: did the recorder's clock? A bag that is written keeps them"
@@ -170,6 +172,7 @@ class Track:
         return found
 
 
+_BACK = "two senders on one topic, a clock set back, or parts out of order? Frames are taken as they were recorded"
 _NUMBERS = 8
 _SHORTEST_S, _LONGEST_S = 1e-3, 5.0
 """The shortest and longest plausible step between frames whose stamps are in nanoseconds [s]."""

@@ -125,6 +125,12 @@ def parse_json(text: bytes) -> Any:
     return json.loads(text, parse_float=_finite, parse_constant=_finite)
 
 
+def check_no_dead_link(folder: Path, *, error: type[RefuError]) -> None:
+    """Raises `error` for a link that leads nowhere, as to a disk that isn't mounted: `mkdir` says "File exists"."""
+    if folder.is_symlink() and not folder.exists():
+        raise error(f"{folder}: a link to {folder.readlink()}, which isn't there; mount its disk or name another place")
+
+
 @contextlib.contextmanager
 def replacing(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """A file to write to, which replaces `path` in one step once it is complete; with `sync`, once it is on the disk.

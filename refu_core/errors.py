@@ -14,7 +14,12 @@ def printable(text: object) -> str:
     Control characters, lone surrogates and the like are escaped; the middle of a text above 300 characters is left out.
     """
     line = _shortened(" ".join(_shortened(str(text), 4 * _MAX_TEXT).split()), _MAX_TEXT)
-    return _shortened("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line), _MAX_TEXT)
+    return _shortened(escaped(line), _MAX_TEXT)
+
+
+def escaped(line: str) -> str:
+    """A line without control characters, lone surrogates and the like."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 def _shortened(text: str, most: int) -> str:

@@ -136,7 +136,7 @@ def check_faces(faces: Any, *, n_vertices: int | None = None) -> NDArray[np.int3
     Raises `MeshError` unless they are integers of that shape below `n_vertices`, three different ones per face.
     """
     try:
-        array = as_numbers(faces.cpu() if hasattr(faces, "cpu") else faces)
+        array = as_numbers(faces.detach().cpu() if hasattr(faces, "detach") else faces)
     except NOT_NUMBERS as error:
         raise MeshError(f"faces must be integers of shape (F, 3), got {type(faces).__name__}: {error}") from error
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or array.dtype.kind not in "iu":

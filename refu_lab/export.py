@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from refu_core import GarmentPipeline, PipelineOutput
 from refu_core._files import replacing
-from refu_core.errors import RefuError, require_type
+from refu_core.errors import RefuError, require_pipeline, require_type
 from refu_core.garments import UvMap
 from refu_core.recordings import turn_from
 from refu_lab.commands.replay import RecordingOptions
@@ -49,6 +49,7 @@ def meshes_of(
 
     Raises `RefuError` for anything but outputs of this pipeline, or none.
     """
+    require_pipeline(pipeline, "garments", "body", error=RefuError)
     outputs = [outputs] if isinstance(outputs, PipelineOutput) else outputs
     require_type(outputs, Sequence, "a pipeline's outputs")
     for output in outputs:

@@ -16,6 +16,7 @@ from msg_adapters import FrameRecord
 from msg_adapters.axes import WORLD_FRAME, up_of
 from msg_adapters.inputs import body_of
 from refu_core import FrameError, RefuError, SmplFrame
+from refu_core.errors import printable
 from refu_core.history import PoseHistory
 from refu_core.keypoints import Proportions
 from refu_core.modes import FOREIGN_BETAS, ONE_STYLE, BetasSource
@@ -122,7 +123,7 @@ def open_source(options: RecordingOptions, pipeline: GarmentPipeline | None = No
             person=options.person,
             worn=Proportions.of_body(load().body) if options.input.exists() else None,  # else it is reported at once
         )
-        description = f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz"
+        description = printable(f"{options.input.name}, {len(motion)} frames at {motion.fps:g} Hz")
         up = upright_turn(motion.poses[:, 0].astype(np.float64))[1] if options.axes == "frame" else None
         kind, decode = adapters.INPUT_TYPES["multiarray"], _decoding(adapters.decoder_for("multiarray"), lambda _: up)
         read = description, INPUT_TOPIC, kind, decode, _motion_records(motion), len(motion)
@@ -146,7 +147,7 @@ def open_source(options: RecordingOptions, pipeline: GarmentPipeline | None = No
         is_smpl = options.axes == "smpl"
         decode = _decoding(bag.decoder, lambda data: None if is_smpl else up_of(adapters.frame_id_of(data, input_type)))
     frame_id = given if given and (is_placed or options.axes == "frame") else WORLD_FRAME
-    read = f"{topic} ({kind})", topic, kind, decode, iter(bag), bag.message_count
+    read = printable(f"{topic} ({kind})"), topic, kind, decode, iter(bag), bag.message_count
     return Source(options, load(), *read, bag, notes, frame_id=frame_id)
 
 

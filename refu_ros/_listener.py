@@ -176,14 +176,13 @@ class Listener:
             if name in self._inputs:  # else the executor had taken it before nobody listened
                 take(data)
 
-        message_class = interface(kind)
+        message_class, where = interface(kind), topic
         try:
+            where = self._node.resolve_topic_name(topic)
             self._inputs[name] = self._node.create_subscription(message_class, topic, come, qos, raw=True, **options)
         except Exception as error:  # rclpy's own say nothing of it
-            what = f"can't subscribe to {self._node.resolve_topic_name(topic)} as {kind}"
-            raise RefuError(
-                f"{what}: is it remapped to a topic of another type, or no name of one? ({error})"
-            ) from error
+            why = f"is it remapped to a topic of another type, or no name of one? ({error})"
+            raise RefuError(f"can't subscribe to {where} as {kind}: {why}") from error
 
     def _come(self, person: str, topic: str, data: bytes) -> None:
         """Records a message and lets it wait for its turn.

@@ -100,6 +100,14 @@ def test_a_path_that_cannot_be_recorded_to_is_one_line(
     assert sorted(tmp_path.iterdir()) == before  # nothing is left of what didn't begin
 
 
+def test_a_link_to_a_disk_that_is_not_there_is_said(tmp_path: Path) -> None:
+    """It was "File exists" where nothing does."""
+    (tmp_path / "usb").symlink_to(tmp_path / "unmounted")
+    for path in ("usb", "usb/bag"):
+        with pytest.raises(BagError, match=r"usb: a link to .*unmounted, which isn't there; mount its disk"):
+            Recorder(tmp_path / path)
+
+
 def test_ever_new_topics_end_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of people who come and go: MCAP numbers topics in 16 bits."""
     monkeypatch.setattr("msg_adapters.bags._recorder._MOST_TOPICS", 3)

@@ -13,6 +13,7 @@ from msg_adapters.bags import _metadata
 from msg_adapters.bags._mcap_writer import McapWriter
 from msg_adapters.definitions import full_type_name, message_definition
 from msg_adapters.errors import BagError
+from refu_core._files import check_no_dead_link
 from refu_core._numbers import NOT_NUMBERS, as_whole
 
 LIBRARY = "refu-ros"
@@ -197,6 +198,7 @@ class BagWriter:
             self._old = self._own_files(self._directory, overwrite=overwrite)
         parent = self.file_path.absolute().parent
         for folder in reversed([folder for folder in (parent, *parent.parents) if not folder.exists()]):
+            check_no_dead_link(folder, error=BagError)
             folder.mkdir(exist_ok=True)
             self._made.append(folder)
         self._entered = [*(folder.parent for folder in self._made), parent]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import NoneType
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from refu_core.body import BodyFit, Surface, load_body
+from refu_core.errors import GarmentError, require_type
 from refu_core.frames import N_BETAS
 from refu_core.garments._template import GarmentTemplate
 from refu_core.mesh import symmetric_solver
@@ -46,7 +48,11 @@ def worn_on(garment: GarmentTemplate, fit: BodyFit | None) -> GarmentTemplate:
     The garment already follows whatever is in the shape space of the body that it was cut for. What else is different
     about the new body is carried over from the skin below the garment. So nothing changes on the garment's own body.
     A child's garment is carried over to the child at an adult's height, and then made as small as the child.
+
+    Raises `GarmentError` for anything but a garment and a fit.
     """
+    require_type(garment, GarmentTemplate, "a garment (load_garment)", error=GarmentError)
+    require_type(fit, (BodyFit, NoneType), "a body's fit (refu_core.body.load_fit), or None", error=GarmentError)
     if fit is None or fit.body.fingerprint == load_body(garment.body).fingerprint:
         return garment
     differs = fit.difference(garment.body)

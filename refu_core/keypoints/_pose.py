@@ -63,9 +63,11 @@ class Proportions:
 
     @classmethod
     def of_body(cls, body: Any) -> Proportions:
-        """The proportions of an `SmplBody`."""
+        """The proportions of an `SmplBody`; raises `BodyError` for anything else."""
         import torch
 
+        if not hasattr(body, "rest_joints"):  # the class isn't known in this layer
+            raise BodyError(f"wanted a body (load_body), got {type(body).__name__}")
         betas = torch.cat([torch.zeros(1, N_BETAS), torch.eye(N_BETAS)]).to(body.device, body.dtype)
         joints = body.rest_joints(betas).cpu().numpy().astype(np.float64)
         return cls(joints[0], np.moveaxis(joints[1:] - joints[0], 0, -1))

@@ -164,12 +164,14 @@ class GarmentPipeline:
             GarmentError: no garment, an unknown one, garments of two bodies, or a bad style.
             BodyError: no such body, or one that isn't in metres, upright, facing forward, in the T-pose and closed.
             WeightsError: no such backbone, or no weights of it for a garment, a mode, and the garment's body.
-            RefuError: an unknown mode, margin or device, or no such number of threads.
+            RefuError: an unknown mode, margin or device, no such number of threads, or a switch that isn't a bool.
         """
         mode = SdfMode.of(sdf, "sdf mode")
         _check_margin(margin)
         require_type(contact, ContactSettings, "ContactSettings")
         require_type(threads, Integral, "a number of threads")
+        for name, switch in (("graph", graph), ("certify", certify), ("collider", collider)):
+            require_type(switch, (bool, np.bool_), f"{name} as True or False")  # "false" would switch it on
         if not 1 <= threads <= _MOST_THREADS:
             raise RefuError(f"wanted 1 to {_MOST_THREADS} threads, got {threads}")
         torch_device = checked_device(device)

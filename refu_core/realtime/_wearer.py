@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from refu_core.backbones import Backbone
 from refu_core.body import BodyFit, Collider, Shape, ShapeMap, SmplBody, require_batch
+from refu_core.errors import FrameError, require_type
 from refu_core.frames import N_BETAS, N_STYLES
 from refu_core.garments import GarmentTemplate, SkinBelow
 from refu_core.refu import Refu
@@ -104,8 +105,10 @@ class Wearer:
     def of(cls, outfit: Outfit, betas: Tensor, style: Tensor | None = None) -> Wearer:
         """For betas (B, 10) and style (B, 4), the mean style if not given. Garments with only one style keep it.
 
-        Differentiable. Raises `FrameError` for anything but tensors of these shapes in the body's precision.
+        Differentiable. Raises `FrameError` for anything but an outfit and tensors of these shapes in the body's
+        precision.
         """
+        require_type(outfit, Outfit, "a pipeline's outfit", error=FrameError)
         dtype = outfit.body.dtype
         require_batch("betas", betas, (N_BETAS,), dtype=dtype)
         if style is not None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from refu_core._warp import Repeated, as_warp, memory
 from refu_core.body import SEGMENTS, SmplBody, part_of_faces
-from refu_core.errors import MeshError
+from refu_core.errors import MeshError, require_type
 from refu_core.garments import GarmentTemplate
 from refu_core.sdf._exact import ExactSdf
 from refu_core.sdf._mesh import FOUND, Found, MeshSdf, ask
@@ -69,8 +69,10 @@ class ApproxSdf(MeshSdf):
 
         Points that a walk finds deeper inside than `exact_from` [m] are queried exactly; with infinity none are.
 
-        Raises `MeshError` when its faces aren't a closed, consistently oriented surface, or are more than a million.
+        Raises `MeshError` for anything but a body, and when its faces aren't a closed, consistently oriented surface,
+        or are more than a million.
         """
+        require_type(body, SmplBody, "a body (load_body)", error=MeshError)
         super().__init__(body.faces, device=body.device if device is None else device)
         if len(self.faces) > MAX_FACES:
             msg = f"the approximate distance is for bodies of up to {MAX_FACES} faces, got {len(self.faces)}: use exact"

@@ -200,7 +200,8 @@ def signed_distance(points: Tensor, corners: Tensor, kind: Tensor, normal: Tenso
 
 def require_outward(vertices: Tensor, faces: Tensor) -> None:
     """Raises `MeshError` where one of B bodies (B, V, 3) [m] with these `faces`, shape (F, 3), is turned inside out."""
-    a, b, c = vertices[:, faces.long()].unbind(2)
+    centred = vertices - vertices[:, :1]  # far from the origin, rounding would decide
+    a, b, c = centred[:, faces.long()].unbind(2)
     if not bool(((a * torch.linalg.cross(b, c)).sum((1, 2)) > 0).all()):
         raise MeshError("the body's faces must be counter-clockwise seen from outside: this body has a negative volume")
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from refu_core import RefuError
-from refu_core._files import expanded
-from refu_core.errors import printable
+from refu_core._files import check_no_dead_link, expanded
+from refu_core.errors import escaped, printable
 from refu_core.modes import BetasSource
 from refu_core.options import Spec, setting, specs_of
 from refu_core.recordings import AXES
@@ -272,6 +272,7 @@ def check_writable(path: Path) -> None:
     """
     folder = path.absolute() if path.is_dir() else path.absolute().parent
     while not folder.exists():
+        check_no_dead_link(folder, error=RefuError)
         folder = folder.parent
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise RefuError(f"{path}: can't be written, {folder} is not a writable folder")
@@ -299,5 +300,6 @@ def tell(args: argparse.Namespace, text: str, content: dict[str, Any], *, code: 
     """Writes the result as JSON if that was asked for, prints its text, and returns the exit code."""
     if args.json is not None:
         write_json(args.json, content)
-    print(text)  # last: its reader may be gone (| head)
+    # Names of files and topics may be anybody's. Last: its reader may be gone (| head)
+    print("\n".join(map(escaped, text.split("\n"))))
     return code

@@ -365,11 +365,20 @@ def test_a_body_may_stand_beside_its_origin() -> None:
     """On legs of either side of x = 0, which then isn't its middle."""
     worn = []
     for beside in (0.001, 0.2):
-        arrays = smpl_arrays("female")
+        arrays = dict(smpl_arrays("female"))  # the other tests get the same one
         arrays["v_template"] = arrays["v_template"] + np.array((beside, 0, 0))
         body = SmplBody(type(load_body("male").arrays).from_mapping(arrays, source="beside"), name="beside")
         worn.append(worn_on(load_garment("short-pant-male"), load_fit(body)).v_template - torch.tensor((beside, 0, 0)))
     assert (worn[1] - worn[0]).norm(dim=1).max() < 2 * MM
+
+
+def test_a_body_may_stand_far_from_its_origin() -> None:
+    """A hundred metres away it was said to be turned inside out: rounding decided."""
+    arrays = smpl_arrays("female")
+    arrays = arrays | {"v_template": arrays["v_template"] + 100}
+    body = SmplBody(type(load_body("male").arrays).from_mapping(arrays, source="far"), name="far")
+    done = GarmentPipeline.load(["short-pant-male"], body=body)(SmplFrame(pose=np.zeros((24, 3))))
+    assert done.stats.garments["short-pant-male"].n_unresolved == 0
 
 
 def test_a_file_with_holes_can_say_what_betas_mean() -> None:

@@ -12,7 +12,19 @@ import pytest
 import torch
 
 import msg_adapters as adapters
-from refu_core import GarmentPipeline, MeshError, RefuError, Resolver, SmplFrame, load_garment
+from refu_core import (
+    ApproxSdf,
+    ExactSdf,
+    GarmentPipeline,
+    MeshError,
+    RefuError,
+    Resolver,
+    SmplFrame,
+    Wearer,
+    load_body,
+    load_garment,
+)
+from refu_core.garments import worn_on
 from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, keypoint_layout
 from refu_core.mesh import Connectivity
 from refu_core.metrics import FoldBands
@@ -68,6 +80,17 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
         for n in (math.nan, None, "x")
     ),
     (lambda: adapters.MarkerMesh(5, FACES, 4), "wanted a marker's namespace, got int"),  # type: ignore[arg-type]
+    (lambda: worn_on(load_garment(WORN), load_body("male")), "wanted a body's fit .*, got SmplBody"),  # type: ignore[arg-type]
+    (lambda: worn_on(WORN, None), "wanted a garment .*, got str"),  # type: ignore[arg-type]
+    (lambda: Wearer.of(pipeline(), torch.zeros(1, 10)), "a pipeline's outfit, got GarmentPipeline"),  # type: ignore[arg-type]
+    (lambda: ApproxSdf("male"), "wanted a body .*, got str"),  # type: ignore[arg-type]
+    (lambda: Proportions.of_body("male"), "wanted a body .*, got str"),
+    (lambda: meshes_of(FRAME, pipeline()(FRAME)), "wanted a GarmentPipeline, got SmplFrame"),  # type: ignore[arg-type]
+    (lambda: ExactSdf(torch.zeros(4, 3, requires_grad=True)), "faces must be integers"),
+    *(
+        (lambda n=n: GarmentPipeline.load([WORN], **{n: "false"}), f"wanted {n} as True or False, got str")  # type: ignore[arg-type]
+        for n in ("graph", "certify", "collider")
+    ),
     *((lambda n=n: PlannerMesh(load_garment(WORN), n), "triangles or more") for n in (math.nan, math.inf)),
     *((lambda n=n: _wide(n), "width.*number of pixels") for n in (None, math.nan, math.inf, 0, np.ones(2))),
 ]

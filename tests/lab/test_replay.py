@@ -21,6 +21,7 @@ import igl
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
@@ -103,6 +104,29 @@ def test_times_of_receipt_that_leap_are_said(late_s: list[float], said: str | No
     warnings = [text for text in replay(options).warnings if "receipt" in text]
     assert len(warnings) == (said is not None)
     assert said is None or said in warnings[0]
+
+
+def test_stamps_that_go_back_now_and_then_are_said(tmp_path: Path) -> None:
+    """Of parts out of order nothing was said as long as most frames were newer than the ones before."""
+    frames = motion(8)
+    bag = write_bag(tmp_path / "parts.mcap", [*frames[4:], *frames[:4]])
+    warnings = replay(ReplayOptions(input=bag, garments=["short-pant-male"], evaluate=False)).warnings
+    assert any("stamps go back in 1 of 8 frames" in text for text in warnings)
+
+
+def test_nothing_that_a_bag_holds_controls_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A topic could colour the terminal, and write lines of its own."""
+    path, topic, kind = tmp_path / "bag\x1b[31m.mcap", "/\x1b]0;owned\x07\nskipped 7 x", "sensor_msgs/msg/JointState"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        number = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b""))
+        writer.add_message(number, 1, adapters.encoder_for("joint_state")(motion(1)[0]), 1)
+        writer.finish()
+    assert run(path, "--garments", "short-pant-male", "--no-evaluate") == 0
+    printed = capsys.readouterr().out
+    assert all(line.isprintable() for line in printed.splitlines())
+    assert not any(line.startswith("skipped") for line in printed.splitlines())
 
 
 def test_as_many_garments_as_frames_and_stamps_kept(small_bag: Path, tmp_path: Path) -> None:
@@ -513,6 +537,18 @@ def test_a_link_to_itself_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     link.symlink_to(link)
     code = run(link, "--garments", "short-pant-male", "--output", tmp_path / "out.mcap")
     assert_one_line(code, capsys.readouterr().err, "link.mcap")
+
+
+@pytest.mark.parametrize("option", ["--output", "--report", "--json"])
+def test_a_link_to_a_disk_that_is_not_there_is_said_at_once(
+    option: str, small_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was said to exist, and of a report only once all frames had been evaluated."""
+    (tmp_path / "usb").symlink_to(tmp_path / "unmounted")
+    code = run(small_bag, "--garments", "short-pant-male", option, tmp_path / "usb" / "out")
+    output = capsys.readouterr()
+    assert_one_line(code, output.err, f"a link to {tmp_path / 'unmounted'}, which isn't there")
+    assert output.out == ""
 
 
 def test_a_bag_directory_is_not_written_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -204,6 +204,17 @@ def test_a_topic_of_two_types_is_said_to_be_one(ros: None) -> None:  # noqa: ARG
         node.destroy_node()
 
 
+def test_a_camera_whose_topic_is_no_name_is_named(ros: None) -> None:  # noqa: ARG001
+    """The error said that some name couldn't be resolved, and not whose."""
+    node = GarmentNode(cli_args=["--ros-args", "-p", "camera_info:=a b"])
+    try:
+        with pytest.raises(RefuError, match=r"can't subscribe to a b as sensor_msgs/msg/CameraInfo.*no name of one"):
+            node._listener.subscribe()
+    finally:
+        node.close()
+        node.destroy_node()
+
+
 def test_messages_that_come_too_fast_leave_a_turn_to_others(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Timers and requests waited behind all messages that had come: twenty seconds, with a crowd's keypoints."""
     executor, done, listener = make_executor(), list[bytes | str](), node._listener
