@@ -74,11 +74,11 @@ def _train(
         few = _seeded(training.CarrySettings(), options, **steps)
         return training.carry_over(*given, like=options.like, settings=few, body=body, quiet=not progress)
     common |= {"backbone": options.backbone, "preset": options.preset}
-    of_all = {stage: n for stage in ("style_shape_steps", "low_steps", "steps") for n in steps.values()}
+    of_all = {} if options.steps is None else dict.fromkeys(("style_shape_steps", "low_steps", "steps"), options.steps)
 
-    def first(samples: int) -> training.PretrainSettings:
+    def first(samples: int) -> Any:
         whole = training.PretrainSettings.of(options.backbone, options.preset, samples=samples)
-        return replace(whole, loop=replace(whole.loop, seed=options.seed), **of_all)
+        return _seeded(whole, options, **of_all)
 
     if options.start is not None:
         common |= {"start": options.start, "mode": options.mode, "joints": _numbers(options.joints)}

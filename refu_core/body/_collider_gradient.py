@@ -119,8 +119,8 @@ def _smooth(known: Anatomy, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: i
 
 def _largest_around(known: Anatomy, values: Tensor) -> Tensor:
     """The largest value among each vertex and its neighbours, of values (V,)."""
-    first, second = known.edges.T
-    neighbour, owner = torch.cat((first, second)), torch.cat((second, first))
+    ring = known.mesh.ring
+    neighbour, owner = (torch.as_tensor(one).long().to(values.device) for one in (ring.items, ring.owner))
     return values.scatter_reduce(0, owner, values[neighbour], "amax")
 
 

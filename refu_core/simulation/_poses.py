@@ -139,10 +139,12 @@ def mirrored(poses: NDArray[np.floating]) -> NDArray[np.float32]:
     return poses[..., MIRRORED_JOINTS, :] * np.array([1, -1, -1], np.float32)
 
 
-def random_pose(
-    rng: np.random.Generator, limits: Mapping[int, Sequence[tuple[float, float]]] = _LIMITS
-) -> NDArray[np.float32]:
+def random_pose(rng: np.random.Generator) -> NDArray[np.float32]:
     """A pose (24, 3) within the limits of human joints [rad]; the middle of each range is likelier than its ends."""
+    return _pose_within(_LIMITS, rng)
+
+
+def _pose_within(limits: Mapping[int, Sequence[tuple[float, float]]], rng: np.random.Generator) -> NDArray[np.float32]:
     pose = np.zeros((N_JOINTS, 3))
     for joint, ranges in limits.items():
         low, high = np.radians(ranges).T
@@ -155,7 +157,7 @@ def random_pose(
 
 def acrobatic_pose(rng: np.random.Generator) -> NDArray[np.float32]:
     """A pose (24, 3) of somebody tilted in any direction, with legs as far up and apart as acrobats' go [rad]."""
-    pose = random_pose(rng, _ACROBATS)
+    pose = _pose_within(_ACROBATS, rng)
     way, tilt = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(0, _MOST_TILT))
     pose[0] = tilt * np.array([np.cos(way), 0, np.sin(way)])
     return without_heading(pose)
@@ -256,7 +258,7 @@ def drawn_pose(
 ) -> tuple[NDArray[np.float32], int, int]:
     """A clip's frame, a varied posture, an acrobat's pose or one within joints' limits, (24, 3) [rad]; clip and frame.
 
-    Without a clip its number is -1 and the frame is the posture's number, or -1 for a random pose.
+    Without a clip its number is -1 and the frame is the posture's number, or -1 for an acrobat's or a random pose.
     """
     kind = rng.random()
     if kind < recorded_share and clips:
