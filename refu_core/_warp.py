@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import operator
 import os
 import sys
 import threading
@@ -154,7 +155,7 @@ class Repeated(threading.local):
         if not all(dim):
             return
         device = tensors[0].device
-        key = (device, *dim, *(tensor.shape for tensor in tensors), *(tensor.dtype for tensor in tensors))
+        key = (device, *dim, *map(_shape_and_dtype, tensors))
         if key not in self._known:
             if len(self._known) >= _MOST_SIZES:
                 self._known.clear()
@@ -170,6 +171,9 @@ class Repeated(threading.local):
             array.data = tensor.data_ptr()
         with torch_stream(device):
             command.launch()
+
+
+_shape_and_dtype = operator.attrgetter("shape", "dtype")
 
 
 @functools.cache

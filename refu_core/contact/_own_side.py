@@ -33,6 +33,10 @@ class OwnSide:
             torch.as_tensor(one).long().to(thickness.device) for one in (ring.start[:-1], ring.items)
         )
 
+    def is_any_deep(self, distance: Tensor) -> bool:
+        """Whether any vertex goes any part of its way, for their signed distances [m], shape (V,)."""
+        return bool((distance < -self._reach).any())
+
     def share(self, distance: Tensor) -> Tensor:
         """How much of its way each vertex goes, for its signed distance [m]; both of shape (V,).
 

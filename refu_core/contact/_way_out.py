@@ -45,7 +45,7 @@ class WayOut(Unpicklable):
         A point that is taken out ends `margin` [m] off the skin, or less where that is inside again, and at most
         `max_displacement` away from `around` (N, 3) [m]. A GPU isn't waited for. Not differentiable.
         """
-        winding = self._winding(points).clone()
+        winding = self._winding(points)
         n_inside = torch.count_nonzero(winding)
         if self._is_serial and not int(n_inside):
             return points, n_inside
@@ -80,7 +80,7 @@ class WayOut(Unpicklable):
         self._skin.fit()
         with torch_stream(self.device):
             self._lift.launch()
-        return self._winding(self._above, wanted).clone()
+        return self._winding(self._above, wanted)
 
     def _nearest_skin(
         self, points: Tensor, is_inside: Tensor, above: Tensor, *, of_samples: bool

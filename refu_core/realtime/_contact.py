@@ -140,10 +140,10 @@ class ContactStage:
         start = self._asked[name](vertices, on_mean=on_mean, reach=reach)
         if not self._has_room:
             return vertices, start
-        share = self.own_sides[name].share(start.distance)
-        if self._is_serial and not bool(share.any()):
+        own_side = self.own_sides[name]
+        if self._is_serial and not own_side.is_any_deep(start.distance):
             return vertices, start
-        vertices = self.own_sides[name](vertices, share, self._skin_below(name))
+        vertices = own_side(vertices, own_side.share(start.distance), self._skin_below(name))
         return vertices, self._asked[name](vertices, on_mean=on_mean, reach=reach)
 
     def lift(

@@ -268,7 +268,7 @@ class GarmentPipeline:
         with self._lock:
             found = [self._wearer(frame) for frame in frames]
             wearer = self._together(tuple(wearer for wearer, _ in found))
-        pose = torch.as_tensor(np.stack([f.pose for f in frames]))
+        pose = torch.as_tensor(np.array([f.pose for f in frames]))
         margins = tuple(one.margin if margin is None else margin for one in self.outfit.wearables.values())
         told = {}
         if self.heeds_past and any(frame.past is not None for frame in frames):
@@ -312,23 +312,27 @@ class GarmentPipeline:
     ) -> PipelineOutput:
         turn, meshes, stats = person.turn, {}, {}
 
-        def on_host(points: Tensor) -> NDArray[np.float32]:
-            made: NDArray[np.float32] = turn(points).cpu().numpy()
-            made.flags.writeable = False  # others in the same pose get it, too
-            return made
-
         def later(points: Tensor) -> Callable[[], NDArray[np.float32]]:
-            return cache(own_settings()(partial(on_host, points)))
+            return cache(partial(_with_own_settings, turn, points))
 
         for name in self.outfit.wearables:
             vertices, raw, numbers, _ = person.garments[name]
-            meshes[name] = GarmentMesh(on_host(vertices), later(raw), self._faces[name], frame.transl)
+            meshes[name] = GarmentMesh(_on_host(turn, vertices), later(raw), self._faces[name], frame.transl)
             stats[name] = GarmentStats.of(numbers.tolist(), ms=0.0 if clock is None else clock.garments[name])
         shift, stage_ms = SkinShift.of(person.shift.tolist()), {} if clock is None else clock.stages
         style = self._style[0].tolist() if frame.style is None and self._style is not None else frame.style
         promised = within_promise(frame, style) and not shift.n_held
         took = FrameStats(stage_ms, stats, self._is_certified, promised, skipped, shift)
         return PipelineOutput(meshes, later(person.body), later(person.skin), took)
+
+
+def _on_host(turn: Callable[[Tensor], Tensor], points: Tensor) -> NDArray[np.float32]:
+    made: NDArray[np.float32] = turn(points).cpu().numpy()
+    made.flags.writeable = False  # others in the same pose get it, too
+    return made
+
+
+_with_own_settings = own_settings()(_on_host)
 
 
 def _key(frame: SmplFrame, *, of_pose: bool = True) -> bytes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -56,6 +58,7 @@ def _limits() -> NDArray[np.float64]:
 
 PROMISED_POSES = _limits()
 """Least and largest components of the joints' rotation vectors of at most half a turn [rad], shape (2, 24, 3)."""
+_LIMITS = PROMISED_POSES.reshape(2, -1).tolist()
 
 
 def within_promise(frame: SmplFrame, style: Sequence[float] | NDArray[np.floating] | None = None) -> bool:
@@ -65,19 +68,24 @@ def within_promise(frame: SmplFrame, style: Sequence[float] | NDArray[np.floatin
 
     The promise has one more condition, which only the posed body can tell: `FrameStats.within_promise`.
     """
-    low, high = PROMISED_POSES
     pose: NDArray[np.floating] = frame.pose
-    if ((pose < low) | (pose > high)).any():  # unless another vector of the same rotation is within
+    if not _is_in_range(pose):  # unless another vector of the same rotation is within
         angle = np.linalg.norm(pose.astype(np.float64), axis=1, keepdims=True)
         turns = np.round(angle / (2 * np.pi))
         pose = pose * (1 - 2 * np.pi * turns / np.maximum(angle, 1e-9))
-        if ((pose < low) | (pose > high)).any():
+        if not _is_in_range(pose):
             return False
     # Together they turn no farther than the sum of their angles, which is enough to decide most frames.
-    if float(np.linalg.norm(pose[SPINE], axis=1).sum()) > PROMISED_BEND and spine_bend(pose) > PROMISED_BEND:
+    if sum(math.hypot(*turn) for turn in pose[SPINE].tolist()) > PROMISED_BEND and spine_bend(pose) > PROMISED_BEND:
         return False
-    sizes = np.abs(np.concatenate((frame.betas, () if style is None else style)))
-    return float(sizes.max()) <= PROMISED_SIZE
+    sizes = map(abs, (*frame.betas.tolist(), *(() if style is None else style)))
+    return float(max(sizes)) <= PROMISED_SIZE
+
+
+def _is_in_range(pose: NDArray[np.floating]) -> bool:
+    # Within a frame, Python's loop over 72 numbers takes a fifth of the time of NumPy's few functions.
+    numbers, (low, high) = pose.ravel().tolist(), _LIMITS
+    return all(map(operator.le, low, numbers)) and all(map(operator.le, numbers, high))
 
 
 def spine_bend(pose: NDArray[np.floating]) -> float:

@@ -131,14 +131,15 @@ class ScaleNet(nn.Module):
         if not isinstance(k, _CompactLatent):
             return lambda vertex, distance: self(row, torch.zeros_like(vertex), vertex, distance)
         # Takes half the time: z's factor of a compact k is folded into g's first layer, once per body.
-        first, bias, last, last_bias = self.g.parameters()
-        inputs = torch.cat((k.projection(row), z.new_full((1, 1), 1 / _DISTANCE_UNIT)), dim=1)
-        weight = (first * inputs).T
+        first, _, last = self.g
+        assert isinstance(first, nn.Linear)
+        assert isinstance(last, nn.Linear)
+        of_latent, of_distance = first.weight[:, :-1] * k.projection(row), first.weight[:, -1] / _DISTANCE_UNIT
 
         def scale(vertex: Tensor, distance: Tensor) -> Tensor:
-            hidden = torch.addmm(bias, k.embedding.index_select(0, vertex), weight[:-1])
-            hidden = functional.relu(hidden + torch.outer(distance, weight[-1]))
-            return self._in_range(torch.addmv(last_bias, hidden, last[0]))
+            hidden = torch.addmm(first.bias, k.embedding.index_select(0, vertex), of_latent.T)
+            hidden = torch.addr(hidden, distance, of_distance).relu_()
+            return self._in_range(torch.addmv(last.bias, hidden, last.weight[0]))
 
         return scale
 
