@@ -47,6 +47,8 @@ class Arrival:
     """From the sender's frame to that of the messages."""
     camera: PinholeCamera | None
     """The camera that sees the person, in the frame of the messages."""
+    told_in: object
+    """The messages' frame and the sender's axes that it was placed by; None: those of now."""
 
 
 class Scene:
@@ -75,7 +77,12 @@ class Scene:
         self._closed = False
 
     def put(
-        self, person: str, frame: SmplFrame, placement: Placement | None = None, camera: PinholeCamera | None = None
+        self,
+        person: str,
+        frame: SmplFrame,
+        placement: Placement | None = None,
+        camera: PinholeCamera | None = None,
+        told_in: object = None,
     ) -> None:
         """Adds a person's frame, with the sender's placement (the messages' own frame if not given) and the camera."""
         now = self._clock()
@@ -89,7 +96,7 @@ class Scene:
             if frame.stamp_ns < self._stamps.get(person, 0):
                 self._statistics.count("back_in_time")
             self._stamps[person] = frame.stamp_ns
-            waiting.append(Arrival(frame, now, placement or Placement(), camera))
+            waiting.append(Arrival(frame, now, placement or Placement(), camera, told_in))
             self._seen[person] = now
             self._came.setdefault(person, deque(maxlen=_PAUSES + 1)).append(now)
             self._changed.notify()
