@@ -256,7 +256,7 @@ class Worker:
             for row in self._outputs:
                 row.forget()
         worn = []
-        for person, frame in frames.items():
+        for person, frame in sorted(frames.items()):  # the same people's messages are laid out once
             arrival, output = batch.arrivals[person], self._dressed[person].output
             there = _there(arrival, batch.settings)
             offset = there.rotation @ frame.transl + there.translation

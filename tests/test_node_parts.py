@@ -443,6 +443,13 @@ def test_a_tick_is_one_message_with_each_persons_stamp(pipeline: GarmentPipeline
     assert markers[1].points[:, 0].mean() == pytest.approx(2.0, abs=0.3)  # SMPL's z is ROS's x
 
 
+def test_a_message_is_laid_out_once_whoever_comes_first(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline)
+    setup.tick(ann=frame(), bob=frame())
+    setup.tick(bob=frame(), ann=frame())
+    assert [[m.ns.split("/")[0] for m in markers] for markers in setup.viewer.messages] == [["ann", "bob"]] * 2
+
+
 def test_unchanged_frames_cost_no_inference_but_move(pipeline: GarmentPipeline) -> None:
     setup = Setup(pipeline)
     setup.tick(ann=frame(stamp_ns=1))
