@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from msg_adapters.errors import TransformError
 from msg_adapters.statistics import Statistics
-from msg_adapters.transforms import SET_BACK_NS, Placement, TransformBuffer
-from refu_core.frames import SmplFrame
+from msg_adapters.transforms import Placement, TransformBuffer
+from refu_core.frames import SET_BACK_NS, SmplFrame
 from refu_core.keypoints import MOST_PEOPLE
 
 if TYPE_CHECKING:
