@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from msg_adapters.errors import TransformError
 from msg_adapters.statistics import Statistics
 from msg_adapters.transforms import Placement, TransformBuffer
-from refu_core.frames import SmplFrame
+from refu_core.frames import SET_BACK_NS, SmplFrame
 from refu_core.keypoints import MOST_PEOPLE
 
 if TYPE_CHECKING:
@@ -47,6 +47,8 @@ class Arrival:
     """From the sender's frame to that of the messages."""
     camera: PinholeCamera | None
     """The camera that sees the person, in the frame of the messages."""
+    told_in: object
+    """The messages' frame and the sender's axes that it was placed by; None: those of now."""
 
 
 class Scene:
@@ -55,8 +57,10 @@ class Scene:
     So a frame that takes a little too long costs no other one, as long as the next ones make up for it. When two are
     waiting and another one comes, only the newest is kept, so that nobody stays behind.
 
+    A frame that comes after a newer one would show its person where they were, and end the motion that cloth swings by.
+
     Thread-safe. Frames that are left out are counted: as `max_rate` while the rate limit holds them back, as `crowd`
-    if there is no room for the person beside `most` others, otherwise as `stale`.
+    if there is no room for the person beside `most` others, as `late` after a newer one, otherwise as `stale`.
     """
 
     def __init__(
@@ -75,7 +79,12 @@ class Scene:
         self._closed = False
 
     def put(
-        self, person: str, frame: SmplFrame, placement: Placement | None = None, camera: PinholeCamera | None = None
+        self,
+        person: str,
+        frame: SmplFrame,
+        placement: Placement | None = None,
+        camera: PinholeCamera | None = None,
+        told_in: object = None,
     ) -> None:
         """Adds a person's frame, with the sender's placement (the messages' own frame if not given) and the camera."""
         now = self._clock()
@@ -83,13 +92,16 @@ class Scene:
             if person not in self._seen and len(self._seen) >= self._most:
                 self._statistics.drop("crowd", f"{self._most} people are here already")
                 return
+            if (late := self._stamps.get(person, 0) - frame.stamp_ns) > 0:
+                self._statistics.count("back_in_time")
+                if late < SET_BACK_NS:
+                    self._statistics.count("skip.late")
+                    return
             waiting = self._pending.setdefault(person, [])
             if self._held or len(waiting) == MOST_WAITING:
                 self._keep(0, waiting)
-            if frame.stamp_ns < self._stamps.get(person, 0):
-                self._statistics.count("back_in_time")
             self._stamps[person] = frame.stamp_ns
-            waiting.append(Arrival(frame, now, placement or Placement(), camera))
+            waiting.append(Arrival(frame, now, placement or Placement(), camera, told_in))
             self._seen[person] = now
             self._came.setdefault(person, deque(maxlen=_PAUSES + 1)).append(now)
             self._changed.notify()

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import EncodeError, TransformError
-from refu_core.frames import PLAUSIBLE_TRANSL
+from refu_core.frames import PLAUSIBLE_TRANSL, SET_BACK_NS
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 HISTORY_NS = 10 * 10**9
@@ -28,8 +28,6 @@ _LONGEST_NAME = 255
 """Of a frame [characters], as in the node's parameter: names of a megabyte each would fill the memory."""
 _LONGEST_WAY = 100
 """Longest chain of parents. Robots have a few dozen; the chain is followed anew for each input."""
-_SET_BACK_NS = 10**9
-"""A frame's transform this much older than the one before tells that time was set back, before `/clock` does [ns]."""
 _UNIT_TOLERANCE = 1e-2
 """How far a quaternion's length may be from 1, as in tf2."""
 _DISCOVERY_S = 1.0
@@ -212,7 +210,7 @@ class TransformBuffer:
         track, now = self._tracks.get(child), self._clock()
         if track is None or track.parent != parent or track.is_static != is_static:
             track = self._tracks[child] = _Track(parent, is_static)
-        elif not is_static and stamp_ns < track.stamps[-1] - _SET_BACK_NS:
+        elif not is_static and stamp_ns < track.stamps[-1] - SET_BACK_NS:
             track.set_back = now
         track.came = now
         track.put(stamp_ns, value.copy(), most=min(_MOST_OWN, _MOST_STAMPS // len(self)))

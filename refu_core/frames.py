@@ -35,6 +35,8 @@ PLAUSIBLE_ANGLE = 1e3
 PLAUSIBLE_COEFFICIENT = 20.0  # standard deviations
 PLAUSIBLE_TRANSL = 1e9
 """[m]"""
+SET_BACK_NS = 10**9
+"""A stamp this much older than the one before tells that time was set back; one less old only comes late [ns]."""
 
 
 def checked_numbers(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.errors import FrameError, require_type
-from refu_core.frames import LAGS, SmplFrame
+from refu_core.frames import LAGS, SET_BACK_NS, SmplFrame
 
 _MOST_PEOPLE = 64
 """How many people are remembered, those seen last; each takes half a megabyte at most."""
@@ -48,8 +48,8 @@ class PoseHistory:
 
     Only the frames of that half second are kept, so nothing can drift. People are taken to have stood still before
     their first frame, and after a pause of over a quarter of a second, a clock that went back, or a leap, of place or
-    direction. Frames may come at any rate from 4 Hz on, and twice: of two with the same stamp the later counts. Not
-    thread-safe.
+    direction. Frames may come at any rate from 4 Hz on, and twice: of two with the same stamp the later counts. One
+    that comes late, by less than a second, is no past of others. Not thread-safe.
 
     `past` is the state `LAGS` ago minus the state now, shape (4, 219): nine numbers of each joint's rotation relative
     to its parent, row by row, those of the root in its own axes; then where the root was [m], in its axes, relative to
@@ -71,6 +71,10 @@ class PoseHistory:
         require_type(person, str, "a person's name", error=FrameError)
         now = _Moment(frame.stamp_ns, Rotation.from_rotvec(frame.pose.astype(np.float64)).as_matrix(), frame.transl)
         known = self._people.pop(person, None)
+        if known and _CLOSEST_NS < known[-1].stamp_ns - now.stamp_ns < SET_BACK_NS:  # newer ones go on from each other
+            self._people[person] = known
+            before = [one for one in known if one.stamp_ns < now.stamp_ns]
+            return replace(frame, past=_past([*before, now] if before and _goes_on(before[-1], now) else [now]))
         if known is None or not _goes_on(known[-1], now):
             known = deque()
         while known and now.stamp_ns <= known[-1].stamp_ns:

@@ -19,7 +19,7 @@ from refu_ros._settings import NodeSettings
 _OVER_BUDGET = 0.1
 """Share of the frames that may be superseded before they are worked on."""
 _LOW_DISK_BYTES = 1 << 30
-_WENT_BACK = "was a clock set back, or do two send on one topic?"
+_WENT_BACK = "was a clock set back, do frames come out of order, or do two send on one topic?"
 _FIRST_INPUT_S = 2.0
 """How long the node listens before it reports that somebody is missing [s]."""
 

@@ -285,7 +285,7 @@ class Listener:
             up = up_of_sender(axes, seen_in or target, placement.rotation).astype(np.float32)
             frame = one.frame if np.array_equal(one.frame.up, up) else replace(one.frame, up=up)
             assert self.scene is not None
-            self.scene.put(one.person, frame, placement, self._camera_at(one.person, frame.stamp_ns))
+            self.scene.put(one.person, frame, placement, self._camera_at(one.person, frame.stamp_ns), (target, axes))
         if bool(self._waiting) == self._retry.is_canceled():
             self._retry.reset() if self._waiting else self._retry.cancel()
 

@@ -130,8 +130,8 @@ class Worker:
 
     def tick(self, take: Callable[[], Mapping[str, Arrival]]) -> None:
         """Works on one frame each of some persons: those that `take` gives."""
-        with self._taking:
-            batch = self._plan(take())
+        with self._taking:  # first who has gone, then who is taken: nobody is dressed whose leaving was told before
+            batch = self._plan(self._scene.leave(self.settings.person_timeout), take())
         outputs: dict[str, PipelineOutput] = {}
         try:
             new = {person: frame for person, frame in batch.frames.items() if person not in batch.known}
@@ -145,7 +145,7 @@ class Worker:
                     self._n_done += 1
                     self._in_order.notify_all()
 
-    def _plan(self, arrivals: Mapping[str, Arrival]) -> _Batch:
+    def _plan(self, gone: list[str], arrivals: Mapping[str, Arrival]) -> _Batch:
         """What there is to do for these people, and with what."""
         settings = self.settings
         fittings = self.fittings
@@ -153,9 +153,8 @@ class Worker:
             self._planned_with, self._is_lost = fittings, False
         if self._told_in != (settings.frame_id, settings.axes):  # nobody has moved: they are only described anew
             self._history, self._told_in = PoseHistory(), (settings.frame_id, settings.axes)
-        gone = self._scene.leave(settings.person_timeout)
         near = self._near(arrivals, settings)
-        gone += [person for person in arrivals if person not in near]
+        gone = gone + [person for person in arrivals if person not in near]
         for person in gone:
             self._history.forget(person)
         if near and not self._outlet.is_watched():
@@ -201,7 +200,9 @@ class Worker:
         for person, arrival in arrivals.items():
             there = _there(arrival, settings)
             place = there.rotation @ arrival.frame.transl + there.translation
-            if settings.max_distance and np.linalg.norm(place) > settings.max_distance:
+            if arrival.told_in not in (None, self._told_in):  # placed before a parameter said where anew
+                self._statistics.count("skip.superseded")
+            elif settings.max_distance and np.linalg.norm(place) > settings.max_distance:
                 self._statistics.count("skip.distance")
             else:
                 near[person] = arrival
@@ -255,7 +256,7 @@ class Worker:
             for row in self._outputs:
                 row.forget()
         worn = []
-        for person, frame in frames.items():
+        for person, frame in sorted(frames.items()):  # the same people's messages are laid out once
             arrival, output = batch.arrivals[person], self._dressed[person].output
             there = _there(arrival, batch.settings)
             offset = there.rotation @ frame.transl + there.translation

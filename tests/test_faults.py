@@ -343,7 +343,7 @@ def test_a_command_whose_device_fails_says_so_in_one_line(
 def test_a_clock_set_back_loses_nothing_and_is_reported(tmp_path: Path) -> None:
     statistics = Statistics()
     scene = Scene(statistics)
-    for stamp in (10, 20, 5, 6, 30):
+    for stamp in (10 * 10**9, 20 * 10**9, 5 * 10**9, 6 * 10**9, 30 * 10**9):
         scene.put("ann", SmplFrame(np.zeros((24, 3), np.float32), stamp_ns=stamp))
         assert scene.take(timeout=0.0)["ann"].frame.stamp_ns == stamp
     statistics.receive()

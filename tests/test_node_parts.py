@@ -443,6 +443,13 @@ def test_a_tick_is_one_message_with_each_persons_stamp(pipeline: GarmentPipeline
     assert markers[1].points[:, 0].mean() == pytest.approx(2.0, abs=0.3)  # SMPL's z is ROS's x
 
 
+def test_a_message_is_laid_out_once_whoever_comes_first(pipeline: GarmentPipeline) -> None:
+    setup = Setup(pipeline)
+    setup.tick(ann=frame(), bob=frame())
+    setup.tick(bob=frame(), ann=frame())
+    assert [[m.ns.split("/")[0] for m in markers] for markers in setup.viewer.messages] == [["ann", "bob"]] * 2
+
+
 def test_unchanged_frames_cost_no_inference_but_move(pipeline: GarmentPipeline) -> None:
     setup = Setup(pipeline)
     setup.tick(ann=frame(stamp_ns=1))
@@ -484,6 +491,21 @@ def test_cloth_comes_to_rest_after_the_pose_has() -> None:
     assert moved[8] > 1e-3  # the pose was the same
     at_rest.tick(ann=frame(0.6))
     np.testing.assert_allclose(points[-1], at_rest.viewer.messages[0][0].points, atol=1e-5)
+
+
+def test_a_frame_that_comes_after_a_newer_one_stops_no_skirt() -> None:
+    """A frame that came 0.1 s late took the motion from the next: vertices jumped by up to 74 mm."""
+    skirt = GarmentPipeline.load(["skirt-female"], sdf="none", collider=False)
+    found = []
+    for order in (range(10), (0, 1, 2, 3, 4, 5, 7, 8, 6, 9)):
+        setup = Setup(skirt, garments=["skirt-female"])
+        for i in order:
+            setup.tick(ann=frame(0.1 * i, stamp_ns=10**9 + i * 10**9 // 15))
+        found.append(setup.viewer.messages[-1][0].points)
+        stamps = [markers[0].stamp_ns for markers in setup.viewer.messages]
+        assert stamps == sorted(stamps)
+    assert setup.total("skip.late") == setup.total("back_in_time") == 1
+    assert np.linalg.norm(found[1] - found[0], axis=1).max() < 0.01
 
 
 @pytest.mark.parametrize("changed", [{"input_axes": "frame"}, {"frame_id": "odom"}])
@@ -1065,6 +1087,19 @@ def test_obstacles_are_whole_whoever_hears_them(pipeline: GarmentPipeline) -> No
         setup.tick(**{person: frame() for person in persons})
         assert [data[-1] for _, data in setup.viewer.sent] == [0] * len(persons)  # ADD
         assert all(len(data) > 10_000 for _, data in setup.viewer.sent)
+
+
+def test_no_obstacle_stands_still_while_another_is_made() -> None:
+    """A planner kept what somebody had worn where they had been, and what they still wore, for seconds."""
+    setup = Setup(GarmentPipeline.load(["tshirt-male", GARMENT], backbone="skinned", sdf="none"), planner_rate=0.0)
+    setup.viewer.others = {"collision_object"}
+    setup.worker.fittings.planner(GARMENT)
+    while not setup.worker.fittings.has_planner(GARMENT):
+        time.sleep(0.01)
+    setup.tick(ann=frame())
+    setup.worker.fittings = Fittings(GarmentPipeline.load(["tshirt-male"], backbone="skinned", sdf="none"))
+    setup.tick(ann=frame(0.1))
+    assert [data[-1] for _, data in setup.viewer.sent] == [0, 1]  # ADD, then REMOVE
 
 
 def test_what_is_due_again_is_not_remembered() -> None:

@@ -176,17 +176,16 @@ class Obstacles(Output):
         if not moment.watchers(self.topic):
             return
         for one in worn:
-            fittings = one.fittings
-            if not all(fittings.has_planner(name) or name in fittings.without_planner for name in fittings.names):
-                return  # not before all are ready
-        for one in worn:
-            if not is_due(self._sent_at, one.person, moment):
+            known, before = one.fittings, self._sent.get(one.person, ())
+            names = {
+                garment_namespace(name, one.person): name for name in known.names if name not in known.without_planner
+            }
+            yield from self._remove([name for name in before if name not in names], moment)
+            ready = {name: garment for name, garment in names.items() if known.has_planner(garment)}
+            self._sent[one.person] = [*dict.fromkeys((*(name for name in before if name in names), *ready))]
+            if not ready or not is_due(self._sent_at, one.person, moment):
                 continue
-            garments = [name for name in one.fittings.names if name not in one.fittings.without_planner]
-            names = [garment_namespace(name, one.person) for name in garments]
-            yield from self._remove([name for name in self._sent.get(one.person, ()) if name not in names], moment)
-            self._sent[one.person] = names
-            for name, garment in zip(names, garments, strict=True):
+            for name, garment in ready.items():
                 data = encode_collision_object(
                     name,
                     stamp_ns=one.stamp_ns,

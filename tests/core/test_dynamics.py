@@ -149,6 +149,15 @@ def test_far_away_no_motion_is_made_of_rounding() -> None:
     assert not any(frame.past.any() for frame in PoseHistory.told(frames) if frame.past is not None)
 
 
+def test_a_frame_that_comes_late_takes_no_past_from_others() -> None:
+    frames = [a_motion(3)(i / 15) for i in range(12)]
+    late = PoseHistory.told([*frames[:7], *frames[8:10], frames[7], *frames[10:]])
+    for got, wanted in zip(late[9:], [PoseHistory.told(frames)[7], *PoseHistory.told(frames)[10:]], strict=True):
+        assert got.past is not None
+        assert wanted.past is not None
+        np.testing.assert_allclose(got.past, wanted.past, atol=0.02)  # the motion is taken as even between frames
+
+
 @pytest.mark.parametrize("break_", ["clock back", "long pause", "leap", "turn"])
 def test_what_does_not_go_on_starts_anew(break_: str) -> None:
     motion, history = a_motion(3), PoseHistory()

@@ -57,6 +57,20 @@ def test_a_clock_set_back_is_reported_and_everybody_stays_dressed(scene: Peer) -
     scene.spin_until(lambda: scene.count("input", "stamps that went back") > 0, "the step back is counted")
 
 
+def test_nobody_goes_back_to_where_they_were(scene: Peer) -> None:
+    """Frames that an estimator sends out of order."""
+    late, newest = (frame(3, stamp_ns=6 * 10**9 + i * 10**8) for i in range(2))
+    scene.dress(newest)
+
+    def is_left_out() -> bool:
+        scene.send(late)
+        return scene.count("garments", "skipped: late") > 0
+
+    scene.spin_until(is_left_out, "the late frame is counted")
+    assert scene.seen(late.stamp_ns) is None
+    scene.dress(frame(4, stamp_ns=7 * 10**9))
+
+
 def test_a_body_that_cannot_be_loaded_is_taken_back(scene: Peer, tmp_path: Path) -> None:
     values: dict[str, list[str]] = defaultdict(list)
 

@@ -525,6 +525,55 @@ def test_each_person_is_where_their_own_marker_is(robot: Callable[..., Robot], f
     scene.until(are_there, "each is where their camera has them")
 
 
+def test_whoever_has_left_while_a_frame_of_theirs_waited_is_removed(robot: Callable[..., Robot]) -> None:
+    """A low rate, or a slow machine: who was told to have gone was dressed once more, and stayed for ever."""
+    scene = robot(garments=[TSHIRT], max_rate=0.5, person_timeout=0.5)
+    scene.hear("garments", MarkerArray, raw=True)
+    scene.sends(frame(1), "garments")
+    held = scene.node.statistics.report().total["frames"]
+    scene.peer.send(frame(2))
+    scene.until(lambda: scene.node.statistics.report().total["frames"] > held, "what waited is dressed")
+
+    def is_empty() -> bool:
+        came = [marker for data in scene.heard["garments"] for marker in decode_marker_array(data)]
+        return came[-1].action == 2 and any(marker.stamp_ns == frame(2).stamp_ns for marker in came)
+
+    scene.until(is_empty, "nobody is shown any more", timeout=20.0)
+
+
+def test_what_was_placed_in_another_frame_is_not_sent_in_this_one(
+    robot: Callable[..., Robot], foreign: Callable[..., Any]
+) -> None:
+    kind = foreign("tf2_msgs/msg/TFMessage")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    scene = robot(garments=[TSHIRT], max_rate=0.5, person_timeout=30.0)
+    static = scene.peer.node.create_publisher(kind, "/tf_static", latched)
+    level = [0, 0, 0, 1]
+    static.publish(
+        encode_transforms(
+            [Transform(0, "map", "camera", [5, 0, 0], level), Transform(0, "odom", "map", [90, 0, 0], level)]
+        )
+    )
+    scene.hear("garments", MarkerArray, raw=True)
+    places: dict[str, set[float]] = {}
+    stamps = iter(range(10**9, 10**12, 10**8))
+
+    def are_told(frame_id: str) -> bool:
+        sent = encoder_for("joint_state")(frame(1, stamp_ns=next(stamps)), frame_id="camera")
+        scene.peer.send_raw(sent)
+        for marker in (one for data in scene.heard["garments"] for one in decode_marker_array(data)):
+            if len(marker.points):
+                places.setdefault(marker.frame_id, set()).add(round(float(marker.points[:, 0].mean()), 1))
+        return frame_id in places
+
+    scene.until(lambda: are_told("map"), "they are in the map")
+    scene.until(lambda: scene.node._listener.scene._pending, "another frame waits")
+    scene.node.set_parameters([Parameter("frame_id", value="odom")])
+    scene.until(lambda: not scene.node._listener.scene._pending, "it is taken")
+    scene.until(lambda: are_told("odom"), "they are in the frame of now")
+    assert {name: min(where) // 10 for name, where in places.items()} == {"map": 0, "odom": 9}
+
+
 def test_who_is_tracked_is_followed(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
     """REP-155: where somebody says who is tracked, nobody else; each in the frame of their body."""
     kind = foreign(IDS_LIST, "tf2_msgs/msg/TFMessage")
