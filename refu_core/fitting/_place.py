@@ -74,6 +74,10 @@ compares differ by less: 30 times, and a tenth of that, took a third longer and 
 _NORMED = 1e-3
 """An extent this near to 1, 2 or another power of two was made so, as in data sets of shapes: it tells no unit. A
 middle this near to the origin, as a share of the extent, was made so, too: the origin says nothing of the body."""
+_AT_ORIGIN = 0.01
+"""What was made so large was put with its middle or its low corner this near to the origin, likewise: elsewhere, a
+length that is a power of two is chance, or a modeller's round number. A jacket of size 2 was 0.0025 off; clothes on a
+body are off by 0.03 and more along some axis."""
 _UNDER_ARMS = 0.1
 """How far below the joints of the shoulders a garment that is held at the waist ends [m]."""
 _HAT = 0.3
@@ -198,11 +202,13 @@ class _Search:
         self.samples = sample(mesh, _N_POINTS)
         under_arms = float(body.joint_template[[LEFT_SHOULDER, RIGHT_SHOULDER], 1].mean()) - _UNDER_ARMS
         self._highest = under_arms if placing.held_at == "waist" else math.inf
-        exponent = float(np.log2(self._extent))
-        self.has_unit = placing.unit is not None or abs(exponent - round(exponent)) > _NORMED
-        """Whether the mesh is in a unit, and wasn't scaled to a size of one."""
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-        off = min(np.abs(middle).max() for middle in ((low + high) / 2, mesh.vertices.mean(0)))
+        middles = np.abs([(low + high) / 2, mesh.vertices.mean(0)])
+        exponent, off = float(np.log2(self._extent)), middles.max(1).min()
+        is_normed = abs(exponent - round(exponent)) < _NORMED
+        is_normed &= np.minimum(middles.min(0), np.abs(low)).max() < _AT_ORIGIN * self._extent
+        self.has_unit = placing.unit is not None or not is_normed
+        """Whether the mesh is in a unit, and wasn't scaled to a size of one."""
         self.has_origin = bool(placing.is_placed or (self.has_unit and off > _NORMED * self._extent))
         """Whether its origin says where it belongs: it is in a unit, and its origin isn't its own middle."""
 

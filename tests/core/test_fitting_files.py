@@ -221,6 +221,14 @@ def test_wide_garments_are_worn_and_no_toys_beside_a_foot(what: str, is_placed: 
     assert np.abs(place.shift).max() < 0.1
 
 
+def test_a_poncho_of_two_panels_is_not_flat() -> None:
+    """Nearly all of it faces forward or back, as cloth on a table faces up or down: it was refused."""
+    v, f = _rings(np.linspace(0.16, 0.24, 30), np.linspace(1.40, 0.85, 30))
+    mesh = SurfaceMesh(v * [2.6, 1, 0.8] + [0, 0, 0.035], f)
+    notes = fit_garment(mesh, load_body("neutral"), name="poncho", longest_edge=0.1).notes
+    assert any("modelled with arms" in note for note in notes)
+
+
 def test_lids_on_the_openings_are_named() -> None:
     shirt = load_garment("tshirt-male")
     v, f = shirt.v_template.double().numpy(), shirt.faces.numpy()

@@ -254,6 +254,11 @@ def test_the_origin_of_what_has_no_unit_says_nothing() -> None:
     assert place.kind == "searched"
 
 
+def test_a_round_length_on_the_body_is_no_norm() -> None:
+    """A pair of socks was refused whose outer sides were 0.4997 m apart, and a skirt 0.5 m long was scaled."""
+    assert next(find_places(cone((0.22, 0.46), (0.175, 0.96)), load_body("female"), Placing())).kind == "floor"
+
+
 def test_what_is_said_is_not_overruled() -> None:
     """A tube of which a third faces the other way was refused, although all was said."""
     body, mesh = load_body("neutral"), cone((0.3, -0.6), (0.3, -0.1))
