@@ -52,7 +52,7 @@ class Blend:
         total = functional.embedding_bag(self.neighbours, field, self.start, mode="sum")
         return total * self.share.to(field)
 
-    def follow(self, points: Tensor, pushed: Tensor, lack: Tensor) -> Tensor:
+    def follow(self, points: Tensor, pushed: Tensor, lack: Tensor, gradient: Tensor) -> Tensor:
         """Garments [m], shape (B, N, 3): the neighbours of the vertices that ReFU `pushed` follow them.
 
         Differentiable.
@@ -61,8 +61,10 @@ class Blend:
             points: Before the push [m], shape (B, N, 3).
             pushed: After it [m], shape (B, N, 3).
             lack: How far each vertex was from the margin [m], shape (B, N).
+            gradient: Of the distance, along which vertices were pushed, shape (B, N, 3).
         """
-        field = self.spread((pushed - points).transpose(0, 1), least=lack.clamp_min(0).T).transpose(0, 1)
+        push, least = (pushed - points).transpose(0, 1), lack.clamp_min(0).T
+        field = self.spread(push, least=least, along=gradient.transpose(0, 1)).transpose(0, 1)
         length = torch.linalg.vector_norm(field.detach(), dim=-1, keepdim=True)
         most = DEFAULT_CONTACT.max_displacement
         blended: Tensor = points + field * (most / length.clamp_min(most))
@@ -73,6 +75,7 @@ class Blend:
         push: Tensor,
         *,
         least: Tensor | None = None,
+        along: Tensor | None = None,
         steps: Sequence[float] = _STEPS,
         reach: int = DEFAULT_CONTACT.near,
     ) -> Tensor:
@@ -82,6 +85,8 @@ class Blend:
             push: The displacements to begin with [m]; zero is no push.
             least: How far each vertex has to go along its push, but no farther than the push itself [m], shape (N, B);
                 by default as far as the push.
+            along: The ways that the pushes go, of any length, which count as constant, shape (N, B, 3).
+                By default those of the pushes, whose derivative is endless where a push is next to nothing.
             steps: How far each sweep goes towards the mean of the neighbours; 1 is all the way.
             reach: Up to how many edges from a pushed vertex others give way.
         """
@@ -92,8 +97,12 @@ class Blend:
         # Vertices without a push have no direction, and lack nothing.
         rows = torch.nonzero(is_pushed.any(dim=1))[:, 0]
         pushed = push[rows]
-        length = torch.linalg.vector_norm(pushed, dim=-1, keepdim=True)
-        direction = pushed / length.clamp_min(torch.finfo(push.dtype).tiny ** 0.5)
+        if along is None:
+            length = torch.linalg.vector_norm(pushed, dim=-1, keepdim=True)
+            direction = pushed / length.clamp_min(torch.finfo(push.dtype).tiny ** 0.5)
+        else:
+            direction = functional.normalize(along[rows].detach(), dim=-1) * is_pushed[rows].unsqueeze(-1)
+            length = (pushed * direction).sum(-1, keepdim=True)
         if least is not None:
             length = torch.minimum(length, least[rows].unsqueeze(-1))
         field = push

@@ -139,7 +139,8 @@ class Predictor:
         batch = SdfSample(sample.distance[None], sample.gradient[None])
         pushed = refu(points[None], batch, z)
         if self._method.is_blended:
-            pushed = self._setup.blend.follow(points[None], pushed, refu.margin - batch.distance)
+            lack = refu.margin - batch.distance
+            pushed = self._setup.blend.follow(points[None], pushed, lack, batch.gradient)
         ms = 1e3 * (time.perf_counter() - start)
         rows = torch.nonzero(sample.distance < refu.margin)[:, 0]
         scale, f = refu.of_body(z), sample.distance[rows]
