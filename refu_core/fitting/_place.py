@@ -181,14 +181,15 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     yield from map(search.told, lying)
     if good or order or lying or any(one.fit.is_good for one in tiers):
         return
+    or_else = "leave --as-placed out" if placing.is_placed else "place it on the body first"
     if not tiers:
         msg = "it reaches higher than it can: between the arms, where it is held at the waist, or far above the head; "
-        raise GarmentError(msg + "say its --unit or --up, or place it on the body first")
+        raise GarmentError(msg + f"say its --unit or --up, or {or_else}")
     fit = min((one.fit for one in tiers), key=lambda fit: fit.cost)
     raise GarmentError(
         f"the mesh doesn't surround the body {body.name}: at best {100 * fit.inside:.0f} % of it is inside, it is "
         f"{1e3 * fit.distance:.0f} mm off, and {100 * fit.facing:.0f} % faces outward; say its --unit, --up or --pose, "
-        f"or place it on the body first{no_opening(mesh.faces)}"
+        f"or {or_else}{no_opening(mesh.faces)}"
     )
 
 

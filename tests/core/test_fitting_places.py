@@ -137,7 +137,7 @@ def test_what_cannot_be_where_it_belongs_is_worn_nowhere_else(monkeypatch: pytes
     assert tried
     head = float(body.v_template[:, 1].max())
     assert max(place.top for place in tried) < head + 0.35
-    with pytest.raises(GarmentError, match="it reaches higher than it can"):
+    with pytest.raises(GarmentError, match=r"it reaches higher than it can.* or leave --as-placed out"):
         next(find_places(narrow_tube(1.38), body, Placing(unit=1.0, up="y", is_placed=True)))
 
 
