@@ -12,6 +12,8 @@ from torch.nn import functional
 
 from refu_core.contact._settings import DEFAULT_CONTACT
 from refu_core.mesh import Connectivity
+from refu_core.refu import unit_direction
+from refu_core.sdf import SdfSample
 
 _STEPS = DEFAULT_CONTACT.blend_steps * (DEFAULT_CONTACT.around // 2)
 
@@ -52,7 +54,7 @@ class Blend:
         total = functional.embedding_bag(self.neighbours, field, self.start, mode="sum")
         return total * self.share.to(field)
 
-    def follow(self, points: Tensor, pushed: Tensor, lack: Tensor, gradient: Tensor) -> Tensor:
+    def follow(self, points: Tensor, pushed: Tensor, sample: SdfSample, margin: float) -> Tensor:
         """Garments [m], shape (B, N, 3): the neighbours of the vertices that ReFU `pushed` follow them.
 
         Differentiable.
@@ -60,11 +62,11 @@ class Blend:
         Args:
             points: Before the push [m], shape (B, N, 3).
             pushed: After it [m], shape (B, N, 3).
-            lack: How far each vertex was from the margin [m], shape (B, N).
-            gradient: Of the distance, along which vertices were pushed, shape (B, N, 3).
+            sample: Distances (B, N) [m] and gradients (B, N, 3) that they were pushed by, to the `margin` [m].
         """
-        push, least = (pushed - points).transpose(0, 1), lack.clamp_min(0).T
-        field = self.spread(push, least=least, along=gradient.transpose(0, 1)).transpose(0, 1)
+        push, least = (pushed - points).transpose(0, 1), (margin - sample.distance).clamp_min(0).T
+        along = unit_direction(sample.gradient.detach()).transpose(0, 1)
+        field = self.spread(push, least=least, along=along).transpose(0, 1)
         length = torch.linalg.vector_norm(field.detach(), dim=-1, keepdim=True)
         most = DEFAULT_CONTACT.max_displacement
         blended: Tensor = points + field * (most / length.clamp_min(most))
@@ -85,8 +87,8 @@ class Blend:
             push: The displacements to begin with [m]; zero is no push.
             least: How far each vertex has to go along its push, but no farther than the push itself [m], shape (N, B);
                 by default as far as the push.
-            along: The ways that the pushes go, of any length, which count as constant, shape (N, B, 3).
-                By default those of the pushes, whose derivative is endless where a push is next to nothing.
+            along: The directions of the pushes, unit vectors that count as constant, shape (N, B, 3); by default those
+                of the pushes themselves, whose derivative is endless where a push is next to nothing.
             steps: How far each sweep goes towards the mean of the neighbours; 1 is all the way.
             reach: Up to how many edges from a pushed vertex others give way.
         """
@@ -101,7 +103,7 @@ class Blend:
             length = torch.linalg.vector_norm(pushed, dim=-1, keepdim=True)
             direction = pushed / length.clamp_min(torch.finfo(push.dtype).tiny ** 0.5)
         else:
-            direction = functional.normalize(along[rows].detach(), dim=-1) * is_pushed[rows].unsqueeze(-1)
+            direction = along[rows] * is_pushed[rows].unsqueeze(-1)
             length = (pushed * direction).sum(-1, keepdim=True)
         if least is not None:
             length = torch.minimum(length, least[rows].unsqueeze(-1))

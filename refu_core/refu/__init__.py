@@ -14,3 +14,4 @@ from refu_core.refu._scale import VertexScale as VertexScale
 from refu_core.refu._unit import MAX_DISPLACEMENT as MAX_DISPLACEMENT
 from refu_core.refu._unit import repulse as repulse
 from refu_core.refu._unit import require_margin as require_margin
+from refu_core.refu._unit import unit_direction as unit_direction

@@ -45,7 +45,7 @@ def pushed_rows(distance: Tensor, margin: float) -> Tensor:
 
 
 def unit_direction(gradient: Tensor) -> Tensor:
-    """∇f/|∇f| (paper, Eq. 3), shape (N, 3); up where that isn't defined. Finite, and so are its derivatives."""
+    """∇f/|∇f| (paper, Eq. 3), shape (…, 3); up where that isn't defined. Finite, and so are its derivatives."""
     length = torch.linalg.vector_norm(gradient.detach(), dim=-1, keepdim=True)
     defined = torch.isfinite(length) & (length > torch.finfo(gradient.dtype).tiny ** 0.5)
     # Replacing it before normalising keeps NaN out of the branch that isn't taken, and so out of the derivative.

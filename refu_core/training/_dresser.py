@@ -102,8 +102,7 @@ class Dresser(nn.Module):
                 sample = self._in_refu(dressed.body, vertices, drape.on_mean)
                 pushed = self.refu(vertices, sample, drape.feature)
                 if self._blend is not None:
-                    lack = self.refu.margin - sample.distance
-                    pushed = self._blend.follow(vertices, pushed, lack, sample.gradient)
+                    pushed = self._blend.follow(vertices, pushed, sample, self.refu.margin)
                 vertices = pushed
             distance = self._in_loss(dressed.body, vertices, drape.on_mean).distance
             in_world = torch.stack([turn(one) for turn, one in zip(dressed.turns, vertices, strict=True)])

@@ -139,8 +139,7 @@ class Predictor:
         batch = SdfSample(sample.distance[None], sample.gradient[None])
         pushed = refu(points[None], batch, z)
         if self._method.is_blended:
-            lack = refu.margin - batch.distance
-            pushed = self._setup.blend.follow(points[None], pushed, lack, batch.gradient)
+            pushed = self._setup.blend.follow(points[None], pushed, batch, refu.margin)
         ms = 1e3 * (time.perf_counter() - start)
         rows = torch.nonzero(sample.distance < refu.margin)[:, 0]
         scale, f = refu.of_body(z), sample.distance[rows]

@@ -117,9 +117,20 @@ def test_a_vertex_that_hardly_lacks_anything_has_a_bounded_derivative() -> None:
     distance = DEFAULT_MARGIN - lack + ((points - points.detach()) * gradient[0]).sum(-1)
     sample = SdfSample(distance[None], gradient)
     pushed = Refu(81, least=1.0, scale=None)(points[None], sample)
-    done = Blend.of_faces(faces, 81).follow(points[None], pushed, DEFAULT_MARGIN - sample.distance, gradient)
+    done = Blend.of_faces(faces, 81).follow(points[None], pushed, sample, DEFAULT_MARGIN)
     (slope,) = torch.autograd.grad(done.square().sum(), points)
     assert slope.norm(dim=1).max() < 10
+
+
+def test_where_no_direction_is_known_neighbours_follow_up() -> None:
+    points, faces = sheet(9)
+    layer, blend = Refu(81, least=1.0, scale=None), Blend.of_faces(faces, 81)
+    distance = torch.full((1, 81), DEFAULT_MARGIN)
+    distance[0, 40] = -0.001
+    up, none = (SdfSample(distance, torch.tensor([0.0, y, 0.0]).expand(1, 81, 3)) for y in (1.0, 0.0))
+    wanted, done = (blend.follow(points[None], layer(points[None], one), one, DEFAULT_MARGIN) for one in (up, none))
+    assert (wanted != points).any(dim=-1).sum() > 8
+    assert torch.equal(done, wanted)
 
 
 def test_refuses_faces_of_other_vertices() -> None:
@@ -260,7 +271,7 @@ def test_the_layer_blends_batches_as_resolve_does(dented: tuple[Tensor, Tensor])
     samples = [Floor().query(garment) for garment in both]
     sample = SdfSample(torch.stack([s.distance for s in samples]), torch.stack([s.gradient for s in samples]))
     layer = Refu(len(points), least=1.0, scale=None)
-    pushed = blend.follow(both, layer(both, sample), layer.margin - sample.distance, sample.gradient)
+    pushed = blend.follow(both, layer(both, sample), sample, layer.margin)
     for garment, done in zip(both, pushed, strict=True):
         # The layer takes all vertices to the margin.
         whole = resolve(garment, Floor(), blend=blend, scale=lambda _rows, distance: 1 / share(distance))

@@ -129,10 +129,10 @@ def test_a_batch_is_dressed_as_the_parts_would_one_by_one(
         sample = (exact if in_refu == "accurate" else approx).query(raw[b].detach(), near=near)
         z = refu.feature(betas, pose, style)
         assert z is not None
-        pushed = refu(raw[b : b + 1], SdfSample(sample.distance[None], sample.gradient[None]), z[b : b + 1])
+        batch = SdfSample(sample.distance[None], sample.gradient[None])
+        pushed = refu(raw[b : b + 1], batch, z[b : b + 1])
         blend = Blend.of_faces(garment.faces, garment.n_vertices)
-        lack = refu.margin - sample.distance[None]
-        wanted = blend.follow(raw[b : b + 1], pushed, lack, sample.gradient[None])[0]
+        wanted = blend.follow(raw[b : b + 1], pushed, batch, refu.margin)[0]
         torch.testing.assert_close(dressed[b, :, :3], turns[b](wanted), rtol=0, atol=1e-5)
         distance = exact.query(wanted.detach()).distance
         torch.testing.assert_close(dressed[b, :, 3].clamp_max(0.004), distance.clamp_max(0.004), rtol=0, atol=1e-5)
