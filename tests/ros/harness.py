@@ -44,6 +44,8 @@ CHEAP = {"input_type": "joint_state", "garments": [GARMENTS[0]], "backbone": "sk
 PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what
 has happened, so only what never does takes that long."""
+ANSWER_S = 60.0
+"""How long a request's answer may take before it counts as lost."""
 
 _TURN_S = 0.004
 """How long a node in the tests' process, and then its peer, does what there is to do, until the test looks again."""
@@ -228,14 +230,23 @@ class Peer:
         return int(self.status(part)[2].get(key, "0"))
 
     def call(self, service_type: Any, name: str, request: Any) -> Any:
-        """A service's answer."""
-        client = self._clients.get(name)
-        if client is None:  # one is kept: while the two find each other, a request or its answer may be lost
-            client = self._clients[name] = self.node.create_client(service_type, name)
-        assert client.wait_for_service(timeout_sec=PATIENCE_S), name
-        future = client.call_async(request)
-        self.spin_until(future.done, f"{name} answers")
-        return future.result()
+        """A service's answer, asked for again by another client where none comes within `ANSWER_S`.
+
+        While a client and its service find each other, the answer to a request may be lost for good.
+        """
+        for _ in range(int(PATIENCE_S / ANSWER_S)):
+            client = self._clients.get(name)
+            if client is None:  # one is kept: between a pair that has found each other nothing is lost
+                client = self._clients[name] = self.node.create_client(service_type, name)
+            assert client.wait_for_service(timeout_sec=PATIENCE_S), name
+            future = client.call_async(request)
+            end = time.monotonic() + ANSWER_S
+            while not future.done() and time.monotonic() < end:
+                rclpy.spin_once(self.node, timeout_sec=0.02)
+            if future.done():
+                return future.result()
+            self.node.destroy_client(self._clients.pop(name))
+        raise AssertionError(f"asked for {PATIENCE_S} s in vain: {name}")
 
     def set(self, **parameters: Any) -> list[Any]:
         """Sets parameters of the node; returns a result for each."""
