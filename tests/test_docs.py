@@ -5,12 +5,15 @@ from __future__ import annotations
 import importlib
 import json
 import re
+from itertools import product
 from pathlib import Path
 
 import pytest
 import yaml
 
+from refu_core.garments import BUILTIN_GARMENTS, load_garment
 from refu_core.skeleton import JOINT_NAMES
+from refu_core.weights import weights_folder
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -124,6 +127,27 @@ def test_the_node_s_page_names_the_joints_in_their_order() -> None:
         r"^The joints, in SMPL's order, are (.*?)\. So", (DOCS / "guide/ros.md").read_text(), re.S | re.M
     )
     assert tuple(re.findall(r"`(\w+)`", listed)) == JOINT_NAMES
+
+
+def test_the_garments_page_says_what_ships() -> None:
+    """Which garments there are, in how many styles, and which of them swing."""
+    text = (DOCS / "guide/garments.md").read_text(encoding="utf-8")
+    said = {}
+    for row in re.findall(r"^\| (`[a-z-]+`.*`-\w+`.*) \|$", text, flags=re.MULTILINE):
+        names, *bodies, styles, swings, _ = row.split("|")
+        for name, body in product(re.findall(r"`(.*?)`", names), re.findall(r"`(.*?)`", "".join(bodies))):
+            said[name + body] = styles.strip() == "four", swings.strip() == "yes"
+    assert said == {
+        name: (load_garment(name).styledirs is not None, (weights_folder(name) / "dynamics.json").exists())
+        for name in BUILTIN_GARMENTS
+    }
+
+
+def test_pages_install_what_their_commands_need() -> None:
+    """Several processes are run by the extra `cluster`."""
+    for page in PAGES:
+        for block in re.findall(r"^```bash\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.S | re.M):
+            assert "pip install" not in block or "--jobs" not in block or "cluster" in block, page
 
 
 def test_named_files_exist() -> None:
