@@ -197,7 +197,7 @@ class MarkerArrayEncoder:
         n = len(self._slots)
         if len(vertices) != n:
             raise EncodeError(f"wanted vertices of {n} meshes, got {len(vertices)}")
-        each = [stamp_ns] * n if isinstance(stamp_ns, (int, np.integer)) else stamp_ns
+        each: Any = stamp_ns if np.ndim(stamp_ns) else [stamp_ns] * n
         stamps = [split_stamp(stamp) for stamp in each]
         if len(stamps) != n:
             raise EncodeError(f"wanted a stamp for all meshes or {n} stamps, got {len(stamps)}")

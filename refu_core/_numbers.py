@@ -18,6 +18,8 @@ def as_numbers(value: Any, *, also: str = "") -> NDArray[Any]:
     What a mask covers wasn't measured, so it is NaN. Booleans, text, dates and complex numbers are none, though NumPy
     would turn them into some. Raises one of `NOT_NUMBERS` for anything else.
     """
+    if value is None:  # NumPy takes it for one NaN
+        raise TypeError("nothing")
     given = np.ma.asanyarray(value) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
     if given.dtype.kind not in "iufO" + also:
         raise TypeError(f"values of the type {given.dtype}")

@@ -72,6 +72,13 @@ def as_warp(tensor: Tensor, dtype: Any) -> Any:
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
+def as_torch(array: Any) -> Tensor:
+    """A tensor over the memory of a Warp array, whatever torch's default device is."""
+    with torch.device(str(array.device)):
+        tensor: Tensor = wp.to_torch(array)
+    return tensor
+
+
 def memory(*shape: int, device: Any = "cpu", dtype: torch.dtype = torch.float32) -> Tensor:
     """A tensor of zeros to compute in, call after call.
 

@@ -133,6 +133,11 @@ def open_smpl_bag(path: str | Path, *, topic: str | None = None, input_type: str
     return SmplBag(reader, chosen, decoder)
 
 
-def iter_smpl_frames(path: str | Path) -> Iterator[FrameRecord]:
-    """The frames of a bag; a message that can't be decoded is a record with its error. Raises as `open_smpl_bag`."""
-    return iter(open_smpl_bag(path))
+def iter_smpl_frames(
+    path: str | Path, *, topic: str | None = None, input_type: str | None = None
+) -> Iterator[FrameRecord]:
+    """The frames of a bag; a message that can't be decoded is a record with its error.
+
+    `topic` and `input_type` choose among topics, and errors are raised, as in `open_smpl_bag`.
+    """
+    return iter(open_smpl_bag(path, topic=topic, input_type=input_type))

@@ -43,7 +43,7 @@ class Decoder:
 
 
 def _input_type(name: str) -> str:
-    full_name = full_type_name(name)
+    full_name = full_type_name(str(name))
     for input_type, message_type in INPUT_TYPES.items():
         if name == input_type or full_name == message_type:
             return input_type

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from refu_core._cache import remembered
-from refu_core._warp import as_warp, ints, memory
+from refu_core._warp import as_torch, as_warp, ints, memory
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
 from refu_core.body._aside import Aside
@@ -188,7 +188,7 @@ class Anatomy:
         """The segment of each vertex, shape (V,)."""
         self.faces = torch.as_tensor(faces.astype(np.int64), device=self.device)
         """Faces of all segments, one after another, indexing vertices and the middles of caps, shape (F, 3)."""
-        self.kept, self.ratio = wp.to_torch(segments.gap), wp.to_torch(segments.ratio)
+        self.kept, self.ratio = as_torch(segments.gap), as_torch(segments.ratio)
         """What vertices keep from segments [m], shape (V, K), and how many times as soft k is as i, shape (K, K)."""
         return segments
 

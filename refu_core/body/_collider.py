@@ -9,7 +9,18 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import IN_ROW, Recorded, Repeated, Unpicklable, as_warp, is_plain, refit, strips, torch_stream
+from refu_core._warp import (
+    IN_ROW,
+    Recorded,
+    Repeated,
+    Unpicklable,
+    as_torch,
+    as_warp,
+    is_plain,
+    refit,
+    strips,
+    torch_stream,
+)
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import Anatomy, ColliderSettings
@@ -156,7 +167,7 @@ class Collider(Unpicklable):
         self.anatomy.memory.counts[kernels.BENT_JOINTS] = -1  # any joint may be bent
         with torch_stream(self.device):
             self._touch()
-        bits: Tensor = wp.to_torch(self.anatomy.work.touched)
+        bits: Tensor = as_torch(self.anatomy.work.touched)
         return (bits[:, None] >> torch.arange(len(self.anatomy.trees), device=bits.device)) & 1 == 1
 
 

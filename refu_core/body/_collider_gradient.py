@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_warp, memory, torch_stream
+from refu_core._warp import as_torch, as_warp, memory, torch_stream
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body._creases import LEVELS
 from refu_core.body._kinematics import PARENTS
@@ -54,7 +54,7 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
 
 def _means(of: Any, points: Tensor) -> Tensor:
     """The weighted means that a `Means` describes, of points (V, 3) [m]."""
-    start, vertex, weight = (wp.to_torch(one) for one in (of.start, of.vertex, of.weight))
+    start, vertex, weight = (as_torch(one) for one in (of.start, of.vertex, of.weight))
     n = len(start) - 1
     owner = torch.repeat_interleave(torch.arange(n, device=points.device), start.long().diff())
     return points.new_zeros(n, 3).index_add(0, owner, points[vertex.long()] * weight.to(points)[:, None])
@@ -92,11 +92,11 @@ def _between(rotation: Tensor) -> tuple[Tensor, Tensor]:
 
 def _crease_step(known: Anatomy, skin: Tensor, p: Tensor, between: Tensor, bent: Tensor) -> Tensor:
     seams, stations = known.creases, _means(known.stations, skin)
-    weights = torch.as_tensor(seams.weights).to(p)
-    through = (stations[torch.as_tensor(seams.stations).long()] * weights[..., None]).sum(1)
-    of_seam = torch.as_tensor(seams.rotation).long()
-    normal = (between[of_seam] @ torch.as_tensor(seams.normal).to(p)[..., None])[..., 0]
-    vertex = torch.as_tensor(seams.vertex).long().to(p.device)
+    weights = torch.from_numpy(seams.weights).to(p)
+    through = (stations[torch.from_numpy(seams.stations).long()] * weights[..., None]).sum(1)
+    of_seam = torch.from_numpy(seams.rotation).long()
+    normal = (between[of_seam] @ torch.from_numpy(seams.normal).to(p)[..., None])[..., 0]
+    vertex = torch.from_numpy(seams.vertex).long().to(p.device)
     lacks = bent[of_seam] * (known.least.to(p) - ((p[vertex] - through) * normal).sum(1))
     return _together(lacks.clamp_min(0)[:, None] * normal, vertex, len(p))
 
@@ -109,10 +109,10 @@ def _smooth(known: Anatomy, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: i
     around = torch.minimum(around, known.farthest.to(skin))
     share = ((around / how.smooth_full).clamp_max(1) * how.smooth_step)[:, None]
     start, ring = known.mesh.ring
-    owner = torch.as_tensor(known.mesh.ring.owner).to(p.device)
-    degree = torch.as_tensor(start).diff().to(p)[:, None]
+    owner = torch.from_numpy(known.mesh.ring.owner).to(p.device)
+    degree = torch.from_numpy(start).diff().to(p)[:, None]
     for _ in range(sweeps):
-        mean = torch.zeros_like(p).index_add(0, owner, p[torch.as_tensor(ring).long()]) / degree
+        mean = torch.zeros_like(p).index_add(0, owner, p[torch.from_numpy(ring).long()]) / degree
         p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, around), p)
     return p
 
@@ -120,7 +120,7 @@ def _smooth(known: Anatomy, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: i
 def _largest_around(known: Anatomy, values: Tensor) -> Tensor:
     """The largest value among each vertex and its neighbours, of values (V,)."""
     ring = known.mesh.ring
-    neighbour, owner = (torch.as_tensor(one).long().to(values.device) for one in (ring.items, ring.owner))
+    neighbour, owner = (torch.from_numpy(one).long().to(values.device) for one in (ring.items, ring.owner))
     return values.scatter_reduce(0, owner, values[neighbour], "amax")
 
 

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from refu_core._warp import Unpicklable, as_warp
+from refu_core._warp import Unpicklable, as_warp, memory
 from refu_core.errors import MeshError
 from refu_core.mesh import Connectivity, as_points, check_faces, grouped
 from refu_core.metrics._intersect_kernels import intersect_kernel
@@ -43,7 +43,7 @@ class Triangles:
         """
         self.faces = faces
         order = grouped(vertices[faces].mean(axis=1)) if len(faces) else np.empty(0, np.int64)
-        blocks, numbers = torch.as_tensor(faces[order]), torch.as_tensor(order.astype(np.int32))
+        blocks, numbers = torch.from_numpy(faces[order]), torch.from_numpy(order.astype(np.int32))
         self.arrays = as_warp(blocks, wp.vec3i), as_warp(numbers, wp.int32)
         """The faces in blocks, and their numbers."""
 
@@ -54,12 +54,12 @@ def crossings(mesh_id: int, vertices: NDArray[np.float32], triangles: Triangles,
     With `is_body` the mesh is that body: each pair is given once, faces that share an edge are left out, and
     faces that share a vertex are given only if they meet elsewhere, too.
     """
-    points = torch.as_tensor(vertices)
+    points = torch.from_numpy(vertices)
     n_faces = len(triangles.faces)
-    count = torch.zeros(1, dtype=torch.int32)
+    count = memory(1, dtype=torch.int32)
     room = max(1024, n_faces)
     while True:
-        found = torch.empty(room, 3, dtype=torch.int32)
+        found = memory(room, 3, dtype=torch.int32)
         count.zero_()
         wp.launch(
             intersect_kernel,
@@ -84,7 +84,7 @@ class SheetChecker(Unpicklable):
         """For a garment of these faces, shape (G, 3). Raises `MeshError` as `check_faces`."""
         self.faces = check_faces(faces)
         self._flat = torch.from_numpy(self.faces.reshape(-1).copy())
-        self._points = torch.zeros(0, 3)
+        self._points = memory(0, 3)
         self._mesh: Any = None
         self._triangles: Triangles | None = None
 

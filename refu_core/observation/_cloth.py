@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dpotri
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 
 from refu_core._cache import keep, recall
-from refu_core._warp import as_warp, ints
+from refu_core._warp import as_warp, ints, memory
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import symmetric_solver, vertex_normals
 from refu_core.observation._match_kernels import match_kernel
@@ -229,7 +229,7 @@ class ObservedCloth:
         # Bit k says that the edge from corner k to the next is on the boundary.
         bits = (on_rim * np.array([1, 2, 4])).sum(1)
         self._rim = ints(bits, "cpu")
-        self._points = garment.v_template.detach().cpu().float().clone()
+        self._points = memory(n, 3).copy_(garment.v_template.detach())
         self._mesh = wp.Mesh(as_warp(self._points, wp.vec3), ints(self._faces.ravel(), "cpu"))
 
     def reset(self) -> None:

@@ -8,7 +8,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from refu_core._numbers import NOT_NUMBERS, as_numbers
-from refu_core._warp import as_warp, ints
+from refu_core._warp import as_warp, ints, memory
 from refu_core.body import blend_transforms
 from refu_core.errors import FrameError, as_before_if_it_fails, require_pipeline, require_type
 from refu_core.frames import SmplFrame
@@ -56,7 +56,7 @@ class Observer:
         sigma = Sigma(pipeline).maps
         self._cloths = {name: ObservedCloth(one, sigma[name], settings) for name, one in pipeline.garments.items()}
         body = pipeline.body
-        self._skin = body.v_template.detach().cpu().float().clone()
+        self._skin = memory(body.n_vertices, 3).copy_(body.v_template.detach())
         self._skin_mesh = wp.Mesh(as_warp(self._skin, wp.vec3), ints(body.faces.cpu().ravel(), "cpu"))
         self._stamp_ns: int | None = None
         self.matched: dict[str, int] = {}

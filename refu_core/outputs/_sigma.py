@@ -261,9 +261,7 @@ def _input_variance(
     `vertices` are without the translation [m], (V, 3); `covariance` is of rotation vectors [rad²], (72, 72) or
     (24, 3, 3).
     """
-    device = body.device
-    pose = torch.tensor(frame.pose, device=device, dtype=body.dtype)[None]
-    posed = body.posed(pose, body.shape(torch.tensor(frame.betas, device=device, dtype=body.dtype)[None]))
+    posed = body(frame.pose[None], frame.betas[None])
     joints = posed.joints[0].cpu().double().numpy()
     turn = posed.transforms.rotation[0].cpu().double().numpy() @ _right_jacobians(frame.pose.astype(np.float64))
     hangs = garment.weights.detach().cpu().double().numpy() @ CARRIED

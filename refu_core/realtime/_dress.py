@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from refu_core.backbones import MAX_OFFSET, upright
@@ -70,22 +71,23 @@ def dress(
         require_batch("past", past, (len(LAGS), N_PAST), dtype=dtype, sizes=(len(pose),))
     if up is not None:
         require_batch("up", up, (3,), dtype=dtype, sizes=(len(pose),))
-    turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
-    posed = wearer.outfit.body.posed(at_root, wearer.shape)
-    lap("body", None)
-    outfit, body, aside = wearer.outfit, posed.vertices, posed.vertices
-    if outfit.collider is not None:
-        aside, rotation = outfit.collider.aside(posed.vertices, posed.transforms.rotation)
-        body = outfit.collider.apart(aside, rotation)
-        lap("collider", None)
-    drapes, seen = {}, pose if up is None else upright(pose, up)
-    for name, garment in wearer.garments.items():
-        drape = _drape(seen, past, wearer, outfit.wearables[name], garment, posed.transforms)
+    with torch.autocast(pose.device.type, enabled=False):  # millimetres need float32
+        turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
+        posed = wearer.outfit.body.posed(at_root, wearer.shape)
+        lap("body", None)
+        outfit, body, aside = wearer.outfit, posed.vertices, posed.vertices
         if outfit.collider is not None:
-            drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
-        drapes[name] = drape
-        lap("backbone", name)
-    return Dressed(body, posed.vertices, aside, drapes, turns, posed.transforms)
+            aside, rotation = outfit.collider.aside(posed.vertices, posed.transforms.rotation)
+            body = outfit.collider.apart(aside, rotation)
+            lap("collider", None)
+        drapes, seen = {}, pose if up is None else upright(pose, up)
+        for name, garment in wearer.garments.items():
+            drape = _drape(seen, past, wearer, outfit.wearables[name], garment, posed.transforms)
+            if outfit.collider is not None:
+                drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
+            drapes[name] = drape
+            lap("backbone", name)
+        return Dressed(body, posed.vertices, aside, drapes, turns, posed.transforms)
 
 
 def require_adjusted(given: object, predicted: Dressed) -> Dressed:

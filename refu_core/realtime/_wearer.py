@@ -113,15 +113,16 @@ class Wearer:
         require_batch("betas", betas, (N_BETAS,), dtype=dtype)
         if style is not None:
             require_batch("style", style, (N_STYLES,), dtype=dtype, sizes=(1, len(betas)))
-        mean = betas.new_zeros(1, betas.shape[1])
-        garments = {}
-        for name, one in outfit.wearables.items():
-            own, known = one.template.own(style), one.known_as(betas)
-            rest = one.template.rest(betas, own)
-            on_mean = one.template.rest(mean, own).expand_as(rest)
-            garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(known, own), known)
-        given = betas.new_zeros(len(betas), N_STYLES) if style is None else style
-        return cls(outfit, betas, given, outfit.body.shape(betas), garments)
+        with torch.autocast(betas.device.type, enabled=False):
+            mean = betas.new_zeros(1, betas.shape[1])
+            garments = {}
+            for name, one in outfit.wearables.items():
+                own, known = one.template.own(style), one.known_as(betas)
+                rest = one.template.rest(betas, own)
+                on_mean = one.template.rest(mean, own).expand_as(rest)
+                garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(known, own), known)
+            given = betas.new_zeros(len(betas), N_STYLES) if style is None else style
+            return cls(outfit, betas, given, outfit.body.shape(betas), garments)
 
     @classmethod
     def of_tensors(cls, outfit: Outfit, tensors: Mapping[str, Tensor]) -> Wearer:

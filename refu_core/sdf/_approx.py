@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_warp, memory
+from refu_core._warp import Repeated, as_torch, as_warp, memory
 from refu_core.body import SEGMENTS, SmplBody, part_of_faces
 from refu_core.errors import MeshError, require_type
 from refu_core.garments import GarmentTemplate
@@ -89,7 +89,7 @@ class ApproxSdf(MeshSdf):
         self._links = torch.zeros(len(part), 2, 4, dtype=torch.int32, device=self.device)
         self._links[:, 0, :3] = self.faces
         self._links[:, 0, 3] = torch.from_numpy(part)
-        self._links[:, 1, :3] = wp.to_torch(self._posed.across)
+        self._links[:, 1, :3] = as_torch(self._posed.across)
         # Guides are spread over the body: one of each part in each cube.
         places = np.column_stack([self._cube, part])
         order = np.lexsort(places.T)  # stable; six times as fast as `np.unique` of rows

@@ -75,7 +75,7 @@ class BandSdf(MeshSdf):
         self.band = band
         self._tree = None if rest is None else BoxTree(self.faces, rest)
         self._tree_is_posed = False
-        self._all = torch.empty(0, dtype=torch.bool)
+        self._all = memory(0, dtype=torch.bool)
 
     def clipped(self, points: Tensor, ring: Adjacency) -> SdfSample:
         """The signed distance and gradient of a garment's vertices [m], shape (N, 3), clipped from above.
@@ -90,7 +90,7 @@ class BandSdf(MeshSdf):
         if len(ring.start) - 1 != len(where):
             raise MeshError(f"the ring is of {len(ring.start) - 1} vertices, got {len(where)}")
         if not len(where):
-            return SdfSample(where[:, 0], where, torch.empty(0, dtype=torch.int32))
+            return SdfSample(where[:, 0], where, where.new_empty(0, dtype=torch.int32))
         found = self._scan(where, beyond=self.band)
         state, patches = self._scan.spread(where, found, ring)
         is_asked = state == int(ASKED)
@@ -130,7 +130,7 @@ class BandSdf(MeshSdf):
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         if near is not None or len(points) < _FEW:
-            near = torch.full((len(points),), -1, dtype=torch.int32) if near is None else near
+            near = points.new_full((len(points),), -1, dtype=torch.int32) if near is None else near
             self.skin()  # fits the tree to the pose
             return ask(self._tell, points, near, self._all)
         found = self._scan(points, beyond=math.inf)
@@ -217,7 +217,7 @@ class Scan:
 
     def spread(self, points: Tensor, found: Found, ring: Adjacency) -> tuple[Tensor, Tensor]:
         """The state of each point, shape (N,), by its edges, and one point of each patch that nothing reaches."""
-        state, queue, patches = torch.empty(3, len(points), dtype=torch.int32)
+        state, queue, patches = points.new_empty(3, len(points), dtype=torch.int32)
         edges = map(torch.from_numpy, ring)
         self._spread((1,), points, self._sizes, *edges, found.distance, found.face, state, queue, patches)
         return state, patches[: int(self._sizes[2])].long()

@@ -36,7 +36,8 @@ class Winding(Unpicklable):
         first, farthest_in, box = _parts(self._empty, n)
         first.fill_(-1)
         farthest_in.fill_(torch.inf)
-        box.copy_(torch.tensor([[torch.inf] * 3, [-torch.inf] * 3]))
+        box[0].fill_(torch.inf)
+        box[1].fill_(-torch.inf)
         # A CPU's compiler keeps more in registers within a loop than from call to call.
         n_faces = len(mesh.faces)
         each = n_faces if device.type == "cpu" else 1

@@ -406,6 +406,7 @@ def test_the_usual_name_decides(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"2 topics could carry the body: /anna.* \(sensor_.*\), /ben.*one by topic"):
         open_smpl_bag(two)
     assert open_smpl_bag(two, topic="ben/smpl_params").topic.name == "/ben/smpl_params"
+    assert [one.topic for one in iter_smpl_frames(two, topic="/ben/smpl_params")] == ["/ben/smpl_params"]
     with pytest.raises(BagError, match=r"no topic /carl; the bag has /anna"):
         open_smpl_bag(two, topic="/carl")
     with pytest.raises(BagError, match="doesn't carry std_msgs/msg/Float32MultiArray"):

@@ -250,6 +250,8 @@ def test_vertices_that_are_not_finite_are_refused(value: float, dtype: type) -> 
         ({"vertices": []}, "of 1 meshes, got 0"),
         ({"transl": np.zeros((2, 3))}, r"translation of shape \(3,\) or \(1, 3\), got \(2, 3\)"),
         ({"stamp_ns": 2**63}, "32 bits of seconds"),
+        ({"stamp_ns": 1.5}, "whole number of nanoseconds, got 1.5"),
+        ({"stamp_ns": None}, "whole number of nanoseconds, got None"),
     ],
 )
 def test_frames_that_are_refused(arguments: dict[str, Any], message: str) -> None:

@@ -10,7 +10,10 @@ import pytest
 import torch
 import trimesh
 
-from refu_core import ExactSdf, GarmentPipeline, Resolver, SmplFrame, Wearer, dress
+from refu_core import ApproxSdf, ExactSdf, GarmentPipeline, Resolver, SmplFrame, Wearer, dress, load_body
+from refu_core.metrics import CollisionChecker, SelfContactDetector
+from refu_core.observation import Observer
+from refu_core.outputs import Clearance, LimbContacts, PlannerMesh, Sigma
 from refu_core.realtime import PipelineOutput
 from refu_core.sdf import BandSdf
 from refu_core.weights import in_steps
@@ -122,3 +125,67 @@ def test_weights_are_stored_the_same() -> None:
         got = in_steps(values, 1)
     assert all(map(torch.equal, got, wanted))
     assert wanted[0].tolist() == [[64, -127], [0, 0]]
+
+
+@pytest.fixture(scope="module")
+def dressed() -> tuple[GarmentPipeline, SmplFrame, PipelineOutput]:
+    pipeline, frame = _load(), _frames()[0]
+    return pipeline, frame, pipeline(frame)
+
+
+@each_setting
+def test_outputs_checks_and_observers_give_the_same(
+    settings: Settings, dressed: tuple[GarmentPipeline, SmplFrame, PipelineOutput]
+) -> None:
+    pipeline, frame, out = dressed
+    name, body = "tshirt-male", pipeline.body
+    mesh, covariance = out[name], np.tile(1e-3 * np.eye(3), (24, 1, 1))
+
+    def answers() -> list[np.ndarray]:
+        checker, detector = CollisionChecker(body.faces), SelfContactDetector(body.faces, body.v_template)
+        checker.update(out.body)
+        found = checker.check(mesh.raw, mesh.faces)
+        return [
+            Clearance.of(pipeline)(out)[name],
+            np.array([contact.area for contact in LimbContacts.of(pipeline)(out)]),
+            Sigma(pipeline)(frame, out, pose_covariance=covariance)[name],
+            PlannerMesh(pipeline.garments[name], max_triangles=500).solid(mesh.local),
+            Observer(pipeline)(frame, mesh.vertices[::9] + 0.01, eye=[0.5, 0.4, 2])[name].local,
+            *(found.pairs, found.inside, found.depth),
+            detector.detect(out.skin).faces,
+        ]
+
+    wanted = answers()
+    with settings():
+        got = answers()
+    for one, other in zip(got, wanted, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@each_setting
+def test_bodies_distances_and_derivatives_are_the_same(
+    settings: Settings, dressed: tuple[GarmentPipeline, SmplFrame, PipelineOutput]
+) -> None:
+    pipeline, frame, out = dressed
+    pose, betas = torch.tensor(frame.pose)[None].requires_grad_(), torch.tensor(frame.betas)[None]
+    points, skin = torch.tensor(out["tshirt-male"].local), torch.tensor(out.body)
+
+    def results() -> list[torch.Tensor]:
+        found = [load_body("male")(frame.pose[None], frame.betas[None]).vertices]
+        for sdf in (ApproxSdf(pipeline.body), BandSdf(pipeline.body.faces), ExactSdf(pipeline.body.faces)):
+            sdf.update(skin)
+            found.append(sdf.query(points).distance)
+        done = dress(pose, Wearer.of(pipeline.outfit, betas))
+        return [*found, done.body, done.drapes["tshirt-male"].vertices]
+
+    def slope(results: list[torch.Tensor]) -> torch.Tensor | None:
+        summed = results[-1].sum() + results[-2].sum()
+        return torch.autograd.grad(summed, pose)[0] if summed.requires_grad else None
+
+    wanted = results()
+    with settings():
+        got = results()
+    for one, other in zip(got, wanted, strict=True):
+        torch.testing.assert_close(one.detach(), other.detach(), rtol=0, atol=1e-6)
+    if (along := slope(got)) is not None:  # there is none in inference mode
+        torch.testing.assert_close(along, slope(wanted))

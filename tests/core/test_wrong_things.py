@@ -54,6 +54,8 @@ def _pushed(kind: torch.dtype) -> Any:
 
 
 WRONG: list[tuple[Callable[[], Any], str]] = [
+    (lambda: SmplFrame(FRAME.pose, betas=None), "betas must be .* numbers, got NoneType: nothing"),  # type: ignore[arg-type]
+    (lambda: adapters.decoder_for(None), "wanted an input type, got None"),  # type: ignore[arg-type]
     (lambda: Clearance.of(pipeline())({}), "a pipeline's output of one person, got dict"),  # type: ignore[arg-type]
     (lambda: LimbContacts.of(pipeline())({}), "a pipeline's output of one person, got dict"),  # type: ignore[arg-type]
     (lambda: Sigma(pipeline())(None, pipeline()(FRAME)), "wanted a SmplFrame, got NoneType"),  # type: ignore[arg-type]
