@@ -40,12 +40,16 @@ class Layer(Unpicklable):
         below: Tensor,
         *,
         settings: ContactSettings = DEFAULT_CONTACT,
+        asks_tree: bool = True,
     ) -> None:
         """For two garments, by faces (F, 3) and vertices in the rest pose (V, 3) [m], counter-clockwise from outside.
 
+        Unless it `asks_tree`, strangers are left alone, and a vertex far below the sheet comes off the fold that its
+        search ended in.
+
         Raises `MeshError` for faces that aren't triangles of these vertices.
         """
-        self._settings = settings
+        self._settings, self._asks_tree = settings, asks_tree
         self.device = above.device
         self._is_serial = self.device.type == "cpu"
         self._below = Sheet(Connectivity.of(below_faces.cpu(), len(below)), below)
@@ -65,7 +69,7 @@ class Layer(Unpicklable):
         data.start, data.near = (ints(one, self.device) for one in starts)
         for name in ("looks", "found", "moved", "reached", "is_reached"):
             setattr(data, name, wp.zeros(n, dtype=wp.int32, device=str(self.device)))
-        self._commands = self._recorded(data, _rules(settings, rest_below[self._below.mesh.edges]))
+        self._commands = self._recorded(data, _rules(settings, rest_below[self._below.mesh.edges], asks_tree))
 
     @torch.no_grad()
     def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
@@ -78,7 +82,8 @@ class Layer(Unpicklable):
             if not goes_on:
                 self._below.take(below)
             self._given.copy_(above)
-            self._below.fit()
+            if self._asks_tree:
+                self._below.fit()
             self._below.point_out()
             self._count.zero_()
             self._commands["look again" if goes_on else "look"].launch()
@@ -111,10 +116,11 @@ class Layer(Unpicklable):
         return {name: Recorded(*launch, self.device) for name, launch in launches.items()}
 
 
-def _rules(settings: ContactSettings, edges: NDArray[np.float32]) -> Any:
+def _rules(settings: ContactSettings, edges: NDArray[np.float32], asks_tree: bool) -> Any:
     """The rules for a sheet whose edges have these ends at rest [m], (E, 2, 3)."""
     rules = kernels.LayerRules()
     rules.gap, rules.reach, rules.alike = settings.gap, settings.layer_reach, settings.alike
+    rules.asks_tree = asks_tree
     rules.longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
     return rules
 

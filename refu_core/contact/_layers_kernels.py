@@ -79,6 +79,8 @@ class LayerRules:
     reach: wp.float32
     longest: wp.float32
     alike: wp.float32
+    asks_tree: wp.bool
+    """Whether strangers, and vertices far below the sheet, are brought off whatever of it is closest."""
 
 
 @wp.func
@@ -262,7 +264,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
         p = above.points[i]
         v = int(above.found[i])
         if v == STRANGER:
-            if is_within(p, below.extent, rules.gap):
+            if rules.asks_tree and is_within(p, below.extent, rules.gap):
                 lift_off_all(i, below, above, rules)
             continue
         squared = wp.length_sq(below.points[v] - p)
@@ -281,7 +283,7 @@ def lift_kernel(each: int, below: Below, above: Above, rules: LayerRules) -> Non
         if wp.length(below.points[v] - p) <= rules.reach + 0.578 * rules.longest:
             face, w, feature, offset = nearest_face(p, v, below)
             if wp.dot(offset, normal_on(face, w, below)) < rules.gap:
-                if wp.length(offset) > 0.5 * rules.reach:  # this may be another fold
+                if rules.asks_tree and wp.length(offset) > 0.5 * rules.reach:  # this may be another fold
                     lift_off_all(i, below, above, rules)
                 else:
                     lift_off(i, face, w, feature, offset, below, above, rules)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -102,6 +103,14 @@ class ContactStage:
             name: {inner: _layer(garments[name], garments[inner], settings) for inner in self.order[:i]}
             for i, name in enumerate(self.order)
         }
+        self._tucks = {
+            name: {
+                outer: _tuck(garments[name], garments[outer], settings)
+                for outer in self.order[i + 1 :]
+                if _is_too_wide(garments[name], garments[outer], self._layers[outer][name])
+            }
+            for i, name in enumerate(self.order)
+        }
 
     def update(self, body: Tensor) -> None:
         """Takes over the body's new pose, shape (V, 3) [m].
@@ -125,6 +134,22 @@ class ContactStage:
         if not self._has_room:
             return vertices
         return self._press[name](vertices, self._skin_below(name))
+
+    def laid(self, predicted: Mapping[str, Tensor], rotation: Tensor) -> dict[str, Tensor]:
+        """Garments as they lie before they are brought off anything, each (V, 3) [m], for joint rotations (24, 3, 3).
+
+        They are unfolded and pressed. What is too wide for a garment above is tucked under it, from the outside in.
+        """
+        laid: dict[str, Tensor] = {}
+        for name in reversed(self.order):
+            vertices = self.press(name, self.unfold(name, predicted[name], rotation))
+            for outer, tuck in self._tucks[name].items():
+                for k in range(self._settings.max_pushes):
+                    vertices, n_out = tuck(vertices, laid[outer], goes_on=k > 0)
+                    if self._is_serial and not int(n_out):
+                        break
+            laid[name] = vertices
+        return laid
 
     def _skin_below(self, name: str) -> Tensor:
         """The skin that each vertex of a garment lies on [m], shape (V, 3)."""
@@ -166,14 +191,14 @@ class ContactStage:
         worn: Mapping[str, Worn],
         *,
         raw: Tensor,
-        pressed: Tensor,
+        laid: Tensor,
         on_mean: Tensor,
         rest: Tensor,
         margin: float,
         scale: float | VertexScale,
         n_layered: Tensor,
     ) -> Worn:
-        """Brings vertices (V, 3) [m] off the body, which has the last word, but within reach of `pressed` (V, 3) [m].
+        """Brings vertices (V, 3) [m] off the body, which has the last word, but within reach of `laid` (V, 3) [m].
 
         `raw` (V, 3) [m] are the vertices as they were predicted, `rest` (V, 3) [m] those of the wearer's garment in the
         rest pose, and `on_mean` is as in `Drape`.
@@ -181,7 +206,7 @@ class ContactStage:
         given = vertices
         vertices, start = self.own_side(name, vertices, on_mean, margin + ASKED_FROM)
         if vertices is not given:
-            pressed = pressed + (vertices - given)
+            laid = laid + (vertices - given)
         assert start.face is not None  # these distances are to faces
         n_clipped = torch.count_nonzero(start.face < 0)
         resolver = self.resolvers[name]
@@ -201,8 +226,8 @@ class ContactStage:
         if self.way_out is None:  # which would count them by itself
             numbers[_N_UNRESOLVED] = torch.count_nonzero(done.distance < 0)
         if was_torn or worn:
-            vertices = self._within_reach(vertices, pressed)
-        vertices = self._taken_out(vertices, pressed, margin, numbers)
+            vertices = self._within_reach(vertices, laid)
+        vertices = self._taken_out(vertices, laid, margin, numbers)
         if self._has_room:
             n_seen = resolver.glimpse(done, vertices, self.sdf)
             if not self._is_serial or int(n_seen):
@@ -210,18 +235,18 @@ class ContactStage:
                 if not self._is_serial:
                     parted = torch.where(n_seen > 0, parted, vertices)
                 if parted is not vertices:
-                    vertices = self._taken_out(self._within_reach(parted, pressed), pressed, margin, numbers)
+                    vertices = self._taken_out(self._within_reach(parted, laid), laid, margin, numbers)
         return Worn(vertices, raw, torch.cat((numbers, n_layered)), n_clipped)
 
-    def _taken_out(self, vertices: Tensor, pressed: Tensor, margin: float, numbers: Tensor) -> Tensor:
+    def _taken_out(self, vertices: Tensor, laid: Tensor, margin: float, numbers: Tensor) -> Tensor:
         """Vertices (V, 3) [m], those inside taken out (`WayOut`); how many have no way is written to `numbers`."""
         if self.way_out is not None:
-            vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, pressed, margin)
+            vertices, numbers[_N_UNRESOLVED] = self.way_out(vertices, laid, margin)
         return vertices
 
-    def _within_reach(self, vertices: Tensor, pressed: Tensor) -> Tensor:
+    def _within_reach(self, vertices: Tensor, laid: Tensor) -> Tensor:
         """No single step takes vertices (V, 3) [m] farther than this; together they may."""
-        return pressed + torch.renorm(vertices - pressed, 2, 0, self._settings.max_displacement)
+        return laid + torch.renorm(vertices - laid, 2, 0, self._settings.max_displacement)
 
     def _part(self, name: str, done: Resolution, *, margin: float) -> Resolution:
         """Parts a garment that is off the body from inner ones where triangles still cut each other.
@@ -249,3 +274,23 @@ class ContactStage:
 
 def _layer(above: GarmentTemplate, below: GarmentTemplate, settings: ContactSettings) -> Layer:
     return Layer(above.faces, above.v_template, below.faces, below.v_template, settings=settings)
+
+
+def _is_too_wide(below: GarmentTemplate, above: GarmentTemplate, layer: Layer) -> bool:
+    """Whether the garment below has to go under the one above: both hang from one place, and cut each other at rest.
+
+    A top that hangs over a skirt goes over it, however wide the skirt is.
+    """
+    if below.card.held_at_waist != above.card.held_at_waist:
+        return False
+    layer(above.v_template, below.v_template)
+    return bool(layer.parting.find(above.v_template))
+
+
+def _tuck(below: GarmentTemplate, above: GarmentTemplate, settings: ContactSettings) -> Layer:
+    """Brings a garment to the inner side of the one above it, which is a layer whose sheet faces inwards.
+
+    A wide sleeve is far outside of a narrow one, so the sheet is felt from as far as cloth may move.
+    """
+    far = replace(settings, layer_reach=settings.max_displacement)
+    return Layer(below.faces, below.v_template, above.faces.flip(1), above.v_template, settings=far, asks_tree=False)

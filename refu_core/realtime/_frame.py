@@ -109,31 +109,33 @@ class FrameStep:
             if self.contact is not None:
                 self.contact.update(body)
             clock.lap("sdf")
+            raw = {name: drape.vertices[person] for name, drape in dressed.drapes.items()}
             garments: dict[str, Worn] = {}
-            for name in self._order:
-                drape = dressed.drapes[name]
-                raw = drape.vertices[person]
-                if self.contact is None:
-                    garments[name] = Worn(raw, raw, raw.new_zeros(N_NUMBERS), raw.new_zeros(()))
-                else:
-                    flat = self.contact.unfold(name, raw, dressed.transforms.rotation[person])
-                    pressed = self.contact.press(name, flat)
-                    vertices, n_layered = self.contact.lift(name, pressed, garments)
+            if self.contact is None:
+                for name in self._order:
+                    garments[name] = Worn(raw[name], raw[name], body.new_zeros(N_NUMBERS), body.new_zeros(()))
+            else:
+                laid = self.contact.laid(raw, dressed.transforms.rotation[person])
+                if len(self._order) > 1:
+                    clock.lap("layers")
+                for name in self._order:
+                    drape = dressed.drapes[name]
+                    vertices, n_layered = self.contact.lift(name, laid[name], garments)
                     if len(self._order) > 1:
                         clock.lap("layers", name)
                     garments[name] = self.contact.resolve(
                         name,
                         vertices,
                         garments,
-                        raw=raw,
-                        pressed=pressed,
+                        raw=raw[name],
+                        laid=laid[name],
                         on_mean=drape.on_mean[person],
                         rest=wearer.garments[name].rest[person],
                         margin=margin_of[name],
                         scale=scale_of(self.outfit.wearables[name], drape, person),
                         n_layered=n_layered,
                     )
-                clock.lap("refu", name)
+                    clock.lap("refu", name)
             persons.append(Person(turn, body, skin, shifts[person], garments))
         return persons
 

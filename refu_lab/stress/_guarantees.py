@@ -86,7 +86,7 @@ def buried(subject: Subject, trial: Trial) -> Iterator[Measurement]:
                 points,
                 {},
                 raw=points,
-                pressed=points,
+                laid=points,
                 on_mean=drape.on_mean[0],
                 rest=skinned[name].template.rest(betas)[0],
                 margin=skinned[name].margin,
@@ -151,7 +151,7 @@ def bounded_jumps(subject: Subject, trial: Trial) -> Iterator[Measurement]:
 def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> dict[str, NDArray[np.floating]]:
     """How far vertices of each garment go to the skin that they lie on, pressed by limbs or deep in the body [m], (N,).
 
-    For garments worn `together`, this includes how far they are unfolded beforehand.
+    For garments worn `together`, this includes how far they are unfolded beforehand, and tucked under each other.
     """
     stage, outfit = subject.contact_stage, subject.pipeline.outfit
     pose, betas = torch.tensor(frame.pose)[None], torch.tensor(frame.betas)[None]
@@ -159,13 +159,12 @@ def _pressed(subject: Subject, frame: SmplFrame, *, together: bool = False) -> d
     with torch.no_grad():
         dressed = dress(pose, Wearer.of(outfit, betas, style), past=torch.from_numpy(pasts_of([frame])))
         stage.update(dressed.body[0])
-        ways = {}
-        for name, one in dressed.drapes.items():
-            raw = flat = one.vertices[0]
-            if together:
-                flat = stage.unfold(name, raw, dressed.transforms.rotation[0])
-            pressed = stage.press(name, flat)
-            ways[name] = stage.own_side(name, pressed, one.on_mean[0], DEFAULT_MARGIN + ASKED_FROM)[0] - raw
+        raw = {name: one.vertices[0] for name, one in dressed.drapes.items()}
+        laid = stage.laid(raw, dressed.transforms.rotation[0]) if together else {n: stage.press(n, raw[n]) for n in raw}
+        ways = {
+            name: stage.own_side(name, laid[name], one.on_mean[0], DEFAULT_MARGIN + ASKED_FROM)[0] - raw[name]
+            for name, one in dressed.drapes.items()
+        }
     return {name: np.linalg.norm(way.numpy(), axis=1) for name, way in ways.items()}
 
 

@@ -17,7 +17,8 @@ from torch import Tensor
 from refu_core import GarmentPipeline, MeshError, SmplFrame
 from refu_core.contact import DEFAULT_CONTACT, Blend, Layer
 from refu_core.garments import inner_first, load_garment
-from refu_core.metrics import CollisionChecker
+from refu_core.metrics import CollisionChecker, SheetChecker
+from refu_core.simulation import posture
 
 Array = NDArray[np.float64]
 FADE, AGREEMENT, ROUNDS = 0.03, 0.25, DEFAULT_CONTACT.around
@@ -250,3 +251,30 @@ def test_worn_together(top: str, backbone: str, sdf: str) -> None:
         assert after.max() < 0.002  # under the gap by so much, and above the sheet
         body.update(out.body)
         assert body.check(out[top].local, faces[top]).n_inside == 0
+
+
+@pytest.mark.parametrize(
+    ("inner", "outer", "is_tucked"),
+    [
+        ("tshirt-male", "shirt-male", True),
+        ("tshirt-male", "longsleeve-male", True),
+        ("short-pant-male", "tshirt-male", False),  # fits
+        ("skirt-female", "tshirt-female", False),  # doesn't, but the T-shirt hangs over it
+    ],
+)
+def test_what_is_too_wide_for_a_garment_above_is_tucked_under_it(inner: str, outer: str, *, is_tucked: bool) -> None:
+    def n_cuts(*, tucks: bool) -> int:
+        pipeline = GarmentPipeline.load([inner, outer])
+        (step,) = pipeline._steps
+        assert step.contact is not None
+        assert bool(step.contact._tucks[inner]) == is_tucked
+        if not tucks:
+            step.contact._tucks[inner].clear()
+        out = pipeline(SmplFrame(posture("hanging arms")))
+        assert all(one.n_unresolved == 0 for one in out.stats.garments.values())
+        checker = SheetChecker(out[inner].faces)
+        checker.update(torch.tensor(out[inner].local))
+        return len(checker.with_other(out[outer].local, out[outer].faces))
+
+    assert n_cuts(tucks=True) == 0
+    assert (n_cuts(tucks=False) > 20) == is_tucked
