@@ -209,7 +209,7 @@ PLACED = [i for i, name in enumerate(JOINT_NAMES) if "hand" not in name and "foo
 """Joints that the layouts show, or that lie between what they show."""
 MODULES = {
     _solver: ("_FLAT", "_LOOSE", "_CLOSE", "_BOLDEST", "_LEAST", "_BENT", "_FAR_LIKELIER"),
-    _tracker: ("_WOUND", "_FASTEST", "_FITS", "_CLEAR", "_NEAR", "_FAR"),
+    _tracker: ("_WOUND", "_FASTEST", "_FITS", "_NEAR", "_FAR"),
 }
 """Numbers that aren't settings."""
 CASES = {"usual": "zed38", "hard": "coco17"}

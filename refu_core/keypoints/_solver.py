@@ -39,16 +39,19 @@ class TrackerSettings:
     in every frame. On 40 recordings of eight layouts the largest beta is 1.5 on average instead of 2.7, and keypoints
     are missed by 2 mm more; of known betas of 2, 1.9 is found of the first and 0.4 to 1 of the next three, instead of
     2.0 and 0.8 to 1.6, and joints are off by 0.1 mm more."""
-    push: float = 5.0
-    """Power of the pelvis's acceleration [m²/s³]: about 9 m/s² for 60 ms."""
-    twist: float = 80.0
-    """Power of the joints' angular acceleration [rad²/s³]: about 35 rad/s² for 60 ms."""
+    push: float = 1.0
+    """Power of the pelvis's acceleration [m²/s³]: twice that of the ten clips, as `twist`."""
+    twist: float = 40.0
+    """Power of the joints' angular acceleration [rad²/s³]: twice that of the ten clips. With 20 they'd be followed too
+    late in fast motion: one usual error in 200 would be beyond 38 mm, where it is 32."""
     growth: float = 1e-3
     """Power of the betas' drift [1/s]: 0.03 in a second, since the first guess may be wrong."""
     rest_after: float = 0.1
     """A joint that isn't seen comes to rest in about this time [s]."""
-    coast: float = 0.2
-    """The rate of anything that isn't seen dies away in this time [s]."""
+    pelvis_coast: float = 0.6
+    """The pelvis's velocity dies away in this time while nothing is seen [s]: so long that of the ten clips lasts."""
+    coast: float = 0.12
+    """So do the rates of the joints [s]. They last as long in the ten clips: 0.1 to 0.15 s, the pelvis's turn 0.3."""
     outlier: float = 3.0
     """A keypoint this many deviations off has half the weight; farther off it soon has none."""
     hold: float = 0.5
@@ -128,6 +131,8 @@ class Solution(NamedTuple):
     """Variance of each of its parts, shape (85,)."""
     step: Array
     """The step to it from the pose where the search began, shape (85,)."""
+    cost: float
+    """How unlikely it is: minus twice the logarithm of its probability, up to a constant."""
 
 
 class Solver:
@@ -214,7 +219,12 @@ class Solver:
         variance = 1 / np.maximum(precision, _FLAT)
         if factor is not None:
             variance[free] = dpotri(factor, lower=1)[0].diagonal()
-        return Solution(pose, variance, step)
+            variance[:3] = variance[:3].mean()  # alike along all axes, or the pose would depend on the world's
+        off = np.square(points - self._skeleton.posed(pose).points).sum(axis=1)
+        unseemly = _squared_deviations(self._skeleton.turning, pose.turns[self._skeleton.turning]).sum()
+        cost = (weights * off / ((1 + off / tolerated) * noise)).sum() + precision[free] @ np.square(step[free])
+        cost += rest * (unseemly + self._settings.shape_pull * np.square(pose.betas).sum())
+        return Solution(pose, variance, step, float(cost))
 
     def _set_adrift(self, weighted: Array, believed: Array) -> None:
         """Takes from the weighted Jacobian (3 K, n) what the head's keypoints say of their common place."""

@@ -13,7 +13,7 @@ from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.errors import FrameError, as_before_if_it_fails, require_type
@@ -65,6 +65,7 @@ class KeypointTracker:
         self._parts = [[np.flatnonzero(np.isin(joints, part) & has_side) for part in limb] for limb in _OUTWARDS]
         power = [np.full(3, settings.push), np.full(3 * N_JOINTS, settings.twist), np.zeros(N_BETAS)]
         self._power = np.concatenate(power) / settings.smoothing**2
+        self._coast = np.concatenate([np.full(3, settings.pelvis_coast), np.full(N_PARTS - 3, settings.coast)])
         self._offset = np.where(layout.is_joint, 0.0, settings.offset_noise)
         self._offset[~layout.is_sure] = settings.unsure_noise
         self.reset()
@@ -113,7 +114,7 @@ class KeypointTracker:
         self._predict(dt)
         self._stamp = stamp_ns
         if (seen.weights > 0).any():
-            sided = self._sided(seen, dt)
+            sided = self._sided(seen)
             if sided is None:
                 self.reset()
                 return self._begin(seen, stamp_ns)
@@ -134,9 +135,8 @@ class KeypointTracker:
         stamp_ns = int(stamp_ns)
         if not self._is_here or 1e-9 * (stamp_ns - self._seen_at) > self._settings.hold:
             return None
-        coast = self._settings.coast
-        ahead = coast * (1 - math.exp(-max(0.0, 1e-9 * (stamp_ns - self._stamp)) / coast))
-        pose = self._pose.moved(ahead * self._rate) if ahead else self._pose
+        dt = 1e-9 * (stamp_ns - self._stamp)
+        pose = self._pose.moved(self._coast * (1 - np.exp(-dt / self._coast)) * self._rate) if dt > 0 else self._pose
         if self._sent_betas is None or np.abs(pose.betas - self._sent_betas).max() > self._settings.beta_step:
             self._sent_betas = pose.betas.copy()
         betas = self._sent_betas
@@ -218,54 +218,41 @@ class KeypointTracker:
         off = np.linalg.norm(self.skeleton.posed(pose).points - seen.points, axis=1)[seen.weights > 0]
         return float(np.sqrt(np.mean(np.minimum(off, 0.5) ** 2))) if len(off) else 0.0
 
-    def _sided(self, seen: _Seen, dt: float) -> _Seen | None:
-        """The frame with sides exchanged where they are wrong; None if it is somebody else's.
+    def _sided(self, seen: _Seen) -> list[_Seen] | None:
+        """The frame as told, and with sides exchanged in each way that may be; None if it is somebody else's.
 
-        If all keypoints are near where they were expected, nothing is changed.
+        If all keypoints are near where they were expected, there is no other way.
         """
         expected = self.skeleton.posed(self._pose).points
         off = np.square(seen.points - expected).sum(axis=1)
         visible = seen.weights > 0
         if off[visible].max() < _NEAR**2:
-            self._swapped_for = 0.0
-            return seen
+            return [seen]
         if visible.sum() >= 4 and float(np.median(off[visible])) > self._settings.jump**2:
             return None
         other = self.skeleton.layout.mirrored
         exchanged = np.square(seen.points - expected[other]).sum(axis=1)
         told, exchanged = (np.where(visible, np.minimum(squared, _FAR**2), 0.0) for squared in (off, exchanged))
-        taken = np.arange(len(other))
-        for group in self._wrong_sided(told, exchanged):
-            taken[group] = other[group]
-        is_swapped = bool((taken != np.arange(len(other))).any())
-        self._swapped_for = self._swapped_for + dt if is_swapped else 0.0
-        if self._swapped_for > self._settings.doubt:  # it was the prediction that had the sides wrong
-            return seen
-        return _Seen(seen.points[taken], seen.weights[taken])
-
-    def _wrong_sided(self, told: Array, exchanged: Array) -> list[NDArray[np.intp]]:
-        """The groups of keypoints whose sides are wrong: of each limb the part that explains most, or all of them.
-
-        Given how far keypoints are from where they were expected, as told and with sides exchanged [m²], shape (K,).
-        """
-
-        def gain(group: NDArray[np.intp]) -> float:
-            before, after = told[group], exchanged[group]
-            is_clear = before.max(initial=0.0) >= _NEAR**2 and after.sum() < _CLEAR * before.sum()
-            return float(before.sum() - after.sum()) if is_clear else 0.0
-
-        of_limbs = [max(limb, key=gain) for limb in self._parts]
-        # A limb of which little is seen is taken for exchanged where most of the person is.
-        found = [self._with_a_side] if gain(self._with_a_side) > sum(map(gain, of_limbs)) else of_limbs
-        return [group for group in found if gain(group) > 0]
+        gained = told - exchanged
+        # All of them, or of each limb the part that explains most.
+        of_limbs = [max(limb, key=lambda part: float(gained[part].sum())) for limb in self._parts]
+        ways = [self._with_a_side], [part for part in of_limbs if gained[part].sum() > 0]
+        found = [seen]
+        for way in ways:
+            if sum(float(gained[part].sum()) for part in way) > 0:
+                taken = np.arange(len(other))
+                for part in way:
+                    taken[part] = other[part]
+                found.append(_Seen(seen.points[taken], seen.weights[taken]))
+        return found
 
     # The filter -----------------------------------------------------------------------------------
 
     def _predict(self, dt: float) -> None:
         """Moves the pose on by rates that die away, and the variances with it."""
         own = self._settings
-        keep = math.exp(-dt / own.coast)
-        ahead = own.coast * (1 - keep)
+        keep = np.exp(-dt / self._coast)
+        ahead = self._coast * (1 - keep)
         self._pose = self._pose.moved(ahead * self._rate)
         power, p, m, r = self._power, self._variance, self._mixed, self._rate_variance
         self._variance = p + 2 * ahead * m + ahead**2 * r + power * dt**3 / 3
@@ -274,10 +261,16 @@ class KeypointTracker:
         self._rate_variance = keep**2 * r + power * dt
         self._rate = keep * self._rate
 
-    def _correct(self, seen: _Seen, dt: float) -> None:
+    def _correct(self, sided: list[_Seen], dt: float) -> None:
+        """Brings the pose to the frame, by the likeliest of the ways in which sides may have been `sided`."""
         rest = min(1.0, dt / self._settings.rest_after)
         prior, steps = 1 / self._variance, self._settings.steps
-        after, variance, step = self._solved(self._pose, seen, prior=prior, rest=rest, steps=steps)
+        solved = [self._solved(self._pose, one, prior=prior, rest=rest, steps=steps) for one in sided]
+        best = min(range(len(solved)), key=lambda i: solved[i].cost)
+        self._swapped_for = self._swapped_for + dt if best else 0.0
+        if self._swapped_for > self._settings.doubt:  # it was the prediction that had the sides wrong
+            best = 0
+        seen, (after, variance, step, _) = sided[best], solved[best]
         gain = self._mixed / self._variance
         shrunk = 1 - variance / self._variance
         self._rate = np.minimum(np.maximum(self._rate + gain * step, -_FASTEST), _FASTEST)
@@ -339,7 +332,5 @@ _FARTHEST = 3.0
 """No person's keypoints are farther than this from their middle, in the median [m]: they are in another unit."""
 _FITS = 0.04
 """A first pose that misses its keypoints by less than this [m] has its sides right."""
-_CLEAR = 0.4
-"""Sides are exchanged if that leaves less than this of the squared distances to where keypoints were expected."""
 _NEAR, _FAR = 0.1, 0.5
 """A keypoint within `_NEAR` of its expected place is on its side; a distance beyond `_FAR` counts as `_FAR` [m]."""

@@ -213,9 +213,9 @@ def test_a_turned_world_turns_the_pose_alone() -> None:
         a, b = plain.update(seen, frame.stamp_ns), other.update(turn.apply(seen) + np.array([1, 2, 10]), frame.stamp_ns)
         assert a is not None
         assert b is not None
-        np.testing.assert_allclose(a.pose[1:], b.pose[1:], atol=2e-3)
+        np.testing.assert_allclose(a.pose[1:], b.pose[1:], atol=1e-5)
         off = Rotation.from_rotvec(b.pose[0]) * (turn * Rotation.from_rotvec(a.pose[0])).inv()
-        assert off.magnitude() < 2e-3
+        assert off.magnitude() < 1e-5
 
 
 # What trackers do -------------------------------------------------------------------------------------------------
