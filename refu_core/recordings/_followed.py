@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, layout_of
+from refu_core.keypoints import KeypointTracker, Proportions, Skeleton, TrackerSettings, layout_of
 from refu_core.keypoints._layouts import POINTS_OF
 from refu_core.recordings._recording import Recording, tell_pace
 from refu_core.recordings._upright import Axes, to_smpl
 from refu_core.skeleton import PARENTS
 
 _FIT = 100  # frames that a person's shape is taken from
+_QUICK = TrackerSettings(smoothing=0.5)
+"""A file's joints have no noise that would have to be smoothed away."""
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
 _LEG = 0.82
 """Length of the mean body's leg, from hip to knee to ankle [m]."""
@@ -72,7 +74,7 @@ def follow(
         if not known:
             raise ValueError("its joints are in no order that a person's are in")
         betas = np.median(known, axis=0)
-    track = KeypointTracker(skeleton, betas=betas)
+    track = KeypointTracker(skeleton, betas=betas, settings=_QUICK)
     frames = [track.update(place, round(1e9 * i / fps)) for i, place in enumerate(places)]
     poses = np.stack([np.full((24, 3), np.nan) if frame is None else frame.pose for frame in frames])
     transl = np.stack([np.full(3, np.nan) if frame is None else frame.transl for frame in frames])
