@@ -281,6 +281,37 @@ def test_legs_exchanged_in_the_first_frame_are_put_right_after_a_second(layout: 
     assert errors(got, known)[35:].mean(axis=1).max() < 0.012
 
 
+def running(t: float) -> SmplFrame:
+    """Somebody who runs at 3.5 m/s, at a time [s]."""
+    phase, pose = 2 * np.pi * 1.4 * t, np.zeros((24, 3))
+    pose[0] = 0.15, 0.15 * np.sin(phase), 0
+    for side, sign in (("left", 1), ("right", -1)):
+        at = {part: JOINT_NAMES.index(f"{side}_{part}") for part in ("hip", "knee", "shoulder", "elbow")}
+        pose[at["hip"], 0] = -0.3 - 0.8 * sign * np.sin(phase)
+        pose[at["knee"], 0] = 0.9 - 0.7 * sign * np.cos(phase)
+        swing = Rotation.from_rotvec([0.7 * sign * np.sin(phase), 0, 0])
+        pose[at["shoulder"]] = (swing * Rotation.from_rotvec([0, 0, -1.2 * sign])).as_rotvec()
+        pose[at["elbow"], 1] = -1.4 * sign
+    return SmplFrame(pose, transl=[0, 0.05 * np.cos(2 * phase), 3.5 * t], stamp_ns=10**9 + round(1e9 * t))
+
+
+@pytest.mark.parametrize("seed", [5, 25, 40])
+def test_a_runner_is_not_turned_round_by_exchanged_sides(seed: int) -> None:
+    """With a third of the keypoints lost, and others far off."""
+    track, rng = KeypointTracker(skeleton("coco17"), betas=np.zeros(10)), np.random.default_rng(seed)
+    for i in range(90):
+        frame = running(i / 30)
+        seen = noisy(points_of(frame, "coco17"), rng, noise=0.02, dropped=0.3)
+        off = rng.random(len(seen)) < 0.06
+        seen[off] += rng.uniform(-0.3, 0.3, (int(off.sum()), 3))
+        if i % 30 in range(20, 29):
+            seen = seen[skeleton("coco17").layout.mirrored]
+        got = track.update(seen, frame.stamp_ns)
+        assert got is not None
+        turned = Rotation.from_rotvec(got.pose[0]).inv() * Rotation.from_rotvec(frame.pose[0])
+        assert np.degrees(turned.magnitude()) < 90
+
+
 def test_an_arm_that_is_not_seen_for_long_comes_to_rest_and_comes_back() -> None:
     kept = keypoint_layout("zed38")
     arm = [i for i, joint in enumerate(kept.joints) if JOINT_NAMES[joint] in ("left_elbow", "left_wrist")]
