@@ -107,7 +107,7 @@ class ContactStage:
             name: {
                 outer: _tuck(garments[name], garments[outer], settings)
                 for outer in self.order[i + 1 :]
-                if _is_too_wide(garments[name], garments[outer], self._layers[outer][name])
+                if _is_too_wide(garments[name], garments[outer], self._layers[outer][name], settings)
             }
             for i, name in enumerate(self.order)
         }
@@ -276,15 +276,16 @@ def _layer(above: GarmentTemplate, below: GarmentTemplate, settings: ContactSett
     return Layer(above.faces, above.v_template, below.faces, below.v_template, settings=settings)
 
 
-def _is_too_wide(below: GarmentTemplate, above: GarmentTemplate, layer: Layer) -> bool:
-    """Whether the garment below has to go under the one above: both hang from one place, and cut each other at rest.
+def _is_too_wide(below: GarmentTemplate, above: GarmentTemplate, layer: Layer, settings: ContactSettings) -> bool:
+    """Whether the garment below has to go under the one above: both hang from one place, and it is outside at rest.
 
-    A top that hangs over a skirt goes over it, however wide the skirt is.
+    By the gap at least: the one above is lifted by that, and by the gap once more. A top that hangs over a skirt goes
+    over it, however wide the skirt is.
     """
     if below.card.held_at_waist != above.card.held_at_waist:
         return False
-    layer(above.v_template, below.v_template)
-    return bool(layer.parting.find(above.v_template))
+    lifted = layer(above.v_template, below.v_template)[0] - above.v_template
+    return bool(lifted.norm(dim=1).max() > 2 * settings.gap)
 
 
 def _tuck(below: GarmentTemplate, above: GarmentTemplate, settings: ContactSettings) -> Layer:
