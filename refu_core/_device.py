@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 
 import torch
 
@@ -39,6 +39,11 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
+def without_autocast(kind: str) -> AbstractContextManager[object]:
+    """No autocast on a kind of device: millimetres need float32. Nothing is entered where it is off already."""
+    return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
+
+
 @contextmanager
 def own_settings() -> Iterator[None]:
     """Torch with this project's own settings, whatever the caller has set.
@@ -49,8 +54,7 @@ def own_settings() -> Iterator[None]:
         settings.enter_context(torch.inference_mode(False))
         settings.enter_context(torch.no_grad())
         for kind in ("cpu", "cuda"):
-            if torch.is_autocast_enabled(kind):
-                settings.enter_context(torch.autocast(kind, enabled=False))
+            settings.enter_context(without_autocast(kind))
         if torch.empty(0).device.type != "cpu":  # a third of the time of asking for the default device
             settings.enter_context(torch.device("cpu"))
         yield

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from refu_core._device import checked_device
+from refu_core._device import checked_device, without_autocast
 from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.body._fingers import without_fingers
 from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, require_batch, rotvec_to_rotmat
@@ -287,7 +287,7 @@ class SmplBody:
         if len(beta) not in (1, batch):
             msg = f"betas must have the shape ({batch}, {N_BETAS}) or (1, {N_BETAS}), got {tuple(beta.shape)}"
             raise FrameError(msg)
-        with torch.autocast(self.device.type, enabled=False):  # in bfloat16 skin was 15 mm off
+        with without_autocast(self.device.type):  # in bfloat16 skin was 15 mm off
             posed = self.posed(theta, self.shape(beta))
         if transl is None:
             return posed

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
+from refu_core._device import without_autocast
 from refu_core.backbones import MAX_OFFSET, upright
 from refu_core.body import RigidTransforms, require_batch
 from refu_core.errors import FrameError, MeshError, RefuError, require_type
@@ -71,7 +71,7 @@ def dress(
         require_batch("past", past, (len(LAGS), N_PAST), dtype=dtype, sizes=(len(pose),))
     if up is not None:
         require_batch("up", up, (3,), dtype=dtype, sizes=(len(pose),))
-    with torch.autocast(pose.device.type, enabled=False):  # millimetres need float32
+    with without_autocast(pose.device.type):
         turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
         posed = wearer.outfit.body.posed(at_root, wearer.shape)
         lap("body", None)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from refu_core._device import without_autocast
 from refu_core.backbones import Backbone
 from refu_core.body import BodyFit, Collider, Shape, ShapeMap, SmplBody, require_batch
 from refu_core.errors import FrameError, require_type
@@ -113,7 +114,7 @@ class Wearer:
         require_batch("betas", betas, (N_BETAS,), dtype=dtype)
         if style is not None:
             require_batch("style", style, (N_STYLES,), dtype=dtype, sizes=(1, len(betas)))
-        with torch.autocast(betas.device.type, enabled=False):
+        with without_autocast(betas.device.type):
             mean = betas.new_zeros(1, betas.shape[1])
             garments = {}
             for name, one in outfit.wearables.items():

@@ -241,8 +241,7 @@ class Peer:
             assert client.wait_for_service(timeout_sec=PATIENCE_S), name
             future = client.call_async(request)
             end = time.monotonic() + ANSWER_S
-            while not future.done() and time.monotonic() < end:
-                rclpy.spin_once(self.node, timeout_sec=0.02)
+            self.spin_until(lambda: future.done() or time.monotonic() > end, name)  # noqa: B023 - ends here
             if future.done():
                 return future.result()
             self.node.destroy_client(self._clients.pop(name))
