@@ -47,9 +47,12 @@ def interruptible() -> Iterator[None]:
     sys.unraisablehook = unraised
     try:
         yield
-    except SystemError as error:  # an interrupt during a function that Numba has compiled is only the cause of one
-        if isinstance(error.__cause__, KeyboardInterrupt):
-            raise error.__cause__ from None
+    except SystemError as error:  # an interrupt in what Numba has compiled is only its cause, or the cause of its cause
+        cause = error.__cause__
+        while isinstance(cause, SystemError):
+            cause = cause.__cause__
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause from None
         raise
     finally:
         sys.unraisablehook = hook

@@ -94,6 +94,17 @@ def test_it_comes_during_what_numba_has_compiled() -> None:
         simulate()
 
 
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_it_may_be_the_cause_of_an_error_of_an_error(depth: int) -> None:
+    """Numba makes arrays in a function of its own: an interrupt there is two errors deep."""
+    error: BaseException = KeyboardInterrupt()
+    for _ in range(depth):
+        last, error = error, SystemError("returned a result with an exception set")
+        error.__cause__ = last
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        raise error
+
+
 def test_an_alarm_of_the_program_stays() -> None:
     rung: list[int] = []
     with handled({signal.SIGALRM: lambda number, _: rung.append(number)}):
