@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -77,12 +77,15 @@ def read(file: Path = REFERENCE) -> Figures:
     return {(row["bag"], row["garment"], row["method"], row["metric"]): row["value"] for row in rows}
 
 
+def bags() -> Iterable[Path]:
+    return sorted(path.parent for path in (ROOT / "bags").glob("*/metadata.yaml"))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--set", action="store_true", help="write the reference anew")
     arguments = parser.parse_args()
-    bags = sorted(path.parent for path in (ROOT / "bags").glob("*/metadata.yaml"))
-    found = {key: value for bag in bags for key, value in figures_of(bag).items()}
+    found = {key: value for bag in bags() for key, value in figures_of(bag).items()}
     if arguments.set:
         write(found)
         print(f"wrote {REFERENCE}")
