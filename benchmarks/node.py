@@ -263,15 +263,9 @@ def main() -> None:
     given = [f"{name}:={value}" for name, value in parameters.items()] + options.parameter
     arguments = [item for parameter in given for item in ("-p", parameter)]
     node = subprocess.Popen([sys.executable, "-m", "refu_ros.garment_node", "--ros-args", *arguments])
-    same = [
-        sys.executable,
-        __file__,
-        f"--persons={options.persons}",
-        f"--rate={options.rate}",
-        f"--seconds={options.seconds if not options.nobody else UNTIL_KILLED_S}",
-        *(["--nobody"] if options.nobody else []),
-        *(["--points"] if options.points else []),
-    ]
+    same = [sys.executable, __file__, *sys.argv[1:]]
+    if options.nobody:
+        same.append(f"--seconds={UNTIL_KILLED_S}")
     sender = subprocess.Popen([*same, "--role=send"], stdout=subprocess.PIPE)
     try:
         if options.nobody:

@@ -37,8 +37,6 @@ from refu_core.body import JOINT_NAMES, PARENTS
 from refu_core.mesh import face_normals
 from refu_lab._ray_kernels import light_kernel
 
-PEOPLE = 600
-"""How many are drawn of each gender."""
 COARSER, LONGEST = 1.215, 0.0235
 """Edge lengths of the body relative to the base mesh's, and their maximum [m]: gives 7,000 vertices."""
 JOINT_RIDGE = 5e-6
@@ -67,7 +65,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     mesh = BaseMesh.read(arguments.data)
-    spaces = build_shape_spaces(mesh, count=PEOPLE)
+    spaces = build_shape_spaces(mesh)
     topology = build_topology(mesh, list(spaces.values()), reference=spaces["neutral"].mean)
     weights = _few_influences(topology.from_base @ mesh.weights)
     for name, space in spaces.items():
@@ -224,8 +222,7 @@ def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     # Weights tied with the first one that is dropped are dropped, too: left and right stay alike.
     largest_left_out = -np.sort(-weights, axis=1)[:, INFLUENCES : INFLUENCES + 1]
     kept = np.where(weights > np.maximum(largest_left_out + 1e-9, 1e-3), weights, 0.0)
-    few: NDArray[np.float64] = kept / kept.sum(1, keepdims=True)
-    return few
+    return kept / kept.sum(1, keepdims=True)
 
 
 def _apply(matrix: scipy.sparse.csr_matrix, basis: NDArray[np.float64]) -> NDArray[np.float64]:

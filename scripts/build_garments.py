@@ -23,43 +23,46 @@ from asset_tools.cuts import Cut, Neckline, Plane, clip
 from asset_tools.makehuman import BaseMesh
 from asset_tools.remesh import remesh
 from asset_tools.shape_space import N_BETAS, ShapeSpace, build_shape_spaces
-from asset_tools.surfaces import Faces, Vertices, attach, boundary_loops, compact, directed_edges, smoothing_matrix
-from build_bodies import PEOPLE
+from asset_tools.surfaces import Faces, Vertices, attach, boundary_loops, compact, smoothing_matrix
 from numpy.typing import NDArray
 
 from refu_core.body import SmplBody, load_body
 from refu_core.fitting._clean import components
-from refu_core.fitting._fit import _larger
+from refu_core.fitting._fit import few_influences, larger, lift_of
 from refu_core.garments import GarmentCard, Tailoring, card_to_json
-from refu_core.mesh import face_normals
+from refu_core.mesh import Connectivity, face_normals
 from refu_core.sdf import ExactSdf
 
 Field = Callable[[Vertices], NDArray[np.float64]]
 
 CLEARANCE = 0.0065
 """Least distance of the finished template from the mean body [m]."""
-INFLUENCES = 6
-"""Joints that move a garment vertex, at most: cloth between the legs follows more of them than skin does."""
 
 
-@dataclass(frozen=True)
-class Garment:
-    """How one garment is made."""
+@dataclass(frozen=True, kw_only=True)
+class Pattern:
+    """How cloth is cut and draped."""
+
+    cuts: tuple[Cut, ...]
+    vertices: int
+    """Wanted number of vertices."""
+    ease: Field
+    """Clearance from the body before smoothing [m], at points (P, 3)."""
+    flare: Field | None = None
+    """Extra distance from the vertical axis through the body [m], at points (P, 3)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Garment(Pattern):
+    """One of the paper's garments, with as many vertices."""
 
     name: str
     body: str
     source: str
     """Group of the base mesh that it is cut from."""
-    cuts: tuple[Cut, ...]
-    vertices: int
-    """Wanted number of vertices: that of the paper's garment."""
-    ease: Field
-    """Clearance from the body before smoothing [m], at points (P, 3)."""
     skin_smoothing: int
     """Rounds of smoothing of the skinning weights."""
     card: GarmentCard
-    flare: Field | None = None
-    """Extra distance from the vertical axis through the body [m], at points (P, 3)."""
 
 
 def ramp(value: NDArray[np.float64], start: float, end: float) -> NDArray[np.float64]:
@@ -212,7 +215,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     mesh = BaseMesh.read(arguments.data)
-    spaces = build_shape_spaces(mesh, count=PEOPLE)
+    spaces = build_shape_spaces(mesh)
     for garment in GARMENTS:
         if arguments.only not in (None, garment.name):
             continue
@@ -246,7 +249,7 @@ def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -
     weights = from_source @ mesh.weights[used]
     for _ in range(garment.skin_smoothing):
         weights = smooth @ weights
-    weights = _few_influences(weights)
+    weights = few_influences(weights, 1e-3)
     basis = (from_source @ space.basis[used].reshape(len(used), -1)).reshape(len(final), -1)
     for _ in range(20):
         basis = smooth @ basis
@@ -260,7 +263,7 @@ def build(garment: Garment, mesh: BaseMesh, space: ShapeSpace, body: SmplBody) -
     }
 
 
-def drape(v: Vertices, f: Faces, garment: Garment, body: SmplBody) -> Vertices:
+def drape(v: Vertices, f: Faces, garment: Pattern, body: SmplBody) -> Vertices:
     """A taut surface round the body at the garment's ease: it spans hollows and follows what protrudes."""
     shortfall = shortfall_from(body)
     smooth = smoothing_matrix(f, len(v))
@@ -279,9 +282,9 @@ def drape(v: Vertices, f: Faces, garment: Garment, body: SmplBody) -> Vertices:
     return v
 
 
-def keep_clear(v: Vertices, f: Faces, shapedirs: NDArray[np.float64], garment: Garment, body: SmplBody) -> Vertices:
+def keep_clear(v: Vertices, f: Faces, shapedirs: NDArray[np.float64], garment: Pattern, body: SmplBody) -> Vertices:
     """Lifts a template off the mean body, and outside the bodies at two standard deviations of every beta."""
-    edges = np.unique(np.sort(directed_edges(f), 1), axis=0)
+    edges = Connectivity.of(f, len(v)).edges
     smooth = smoothing_matrix(f, len(v))
     edges_on = _edges_on_cuts(v, f, garment.cuts)
     shapes = [(np.zeros(N_BETAS), CLEARANCE)]
@@ -291,17 +294,12 @@ def keep_clear(v: Vertices, f: Faces, shapedirs: NDArray[np.float64], garment: G
         lift = np.zeros_like(v)
         for betas, clearance, shortfall in bodies:
             shaped = v + shapedirs @ betas
-            lift = _larger(lift, shortfall(shaped, clearance))
-            middles = shortfall(shaped[edges].mean(1), clearance)
-            for end in (0, 1):
-                most = np.zeros_like(v)
-                order = np.argsort(np.linalg.norm(middles, axis=1))
-                most[edges[order, end]] = middles[order]  # the last one written to a vertex is its longest
-                lift = _larger(lift, most)
+            lift = larger(lift, shortfall(shaped, clearance))
+            lift = lift_of(lift, shortfall(shaped[edges].mean(1), clearance), edges)
         if not np.linalg.norm(lift, axis=1).max() > 2e-5:
             break
         # The neighbours share the lift; otherwise cloth would show bumps.
-        v = v + _larger(lift, 0.8 * (smooth @ lift))
+        v = v + larger(lift, 0.8 * (smooth @ lift))
         for loop, cut in edges_on:
             v[loop] = cut.project(v[loop])
     return v
@@ -350,13 +348,6 @@ def area(v: Vertices, f: Faces) -> float:
 def edge_for(v: Vertices, f: Faces, vertices: int) -> float:
     """Edge length of equilateral triangles that cover the mesh with `vertices` vertices [m]."""
     return float(np.sqrt(area(v, f) / (2 * vertices) * 4 / np.sqrt(3)))
-
-
-def _few_influences(weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    weights = weights.copy()
-    np.put_along_axis(weights, np.argsort(-weights, axis=1)[:, INFLUENCES:], 0.0, axis=1)
-    weights[weights < 1e-3] = 0.0
-    return weights / weights.sum(1, keepdims=True)
 
 
 if __name__ == "__main__":

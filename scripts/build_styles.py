@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from refu_core.body import SmplBody, load_body
 from refu_core.frames import N_BETAS
-from refu_core.garments import BUILTIN_GARMENTS, N_STYLES, GarmentTemplate, load_garment
+from refu_core.garments import N_STYLES, PAPER_GARMENTS, GarmentTemplate, load_garment
 from refu_core.garments._file import shortened
-from refu_core.mesh import vertex_areas, vertex_normals
+from refu_core.mesh import face_normals, vertex_areas, vertex_normals
 from refu_core.sdf import ExactSdf
 from refu_core.simulation._cloth import F32, ClothTopology
 from refu_core.simulation._drape import Draper
@@ -59,11 +59,15 @@ class _Cut:
         self._sdf = ExactSdf(body.faces)
         self._sdf.update(body.rest_vertices(torch.zeros(1, N_BETAS))[0])
 
+    def below(self, start: float) -> F64:
+        """How far below a height [m] each vertex is, from 0 there to 1 at the lowest hem, slowly at first, (N,)."""
+        low = self.x[self.bottom, 1].mean()
+        return np.clip((start - self.x[:, 1]) / (start - low), 0, None) ** 1.2
+
     def normals(self) -> F64:
         """Outward unit normals, smoothed so that a wider cut doesn't deepen the folds of the body under it."""
         normal = self.smooth(vertex_normals(self.x, self.topology.mesh.faces), 30)
-        unit: F64 = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        return unit
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def smooth(self, field: F64, rounds: int = 10) -> F64:
         """A field (N, 3) after `rounds` of moving each vertex halfway to the mean of its neighbours."""
@@ -85,16 +89,14 @@ class _Cut:
 
 def _length(cut: _Cut) -> F64:
     start = cut.joints[1:3, 1].mean() + 0.02 if cut.held else cut.joints[16:18, 1].mean() - 0.12
-    low = cut.x[cut.bottom, 1].mean()
-    share = np.clip((start - cut.x[:, 1]) / (start - low), 0, None) ** 1.2
-    return np.stack((0 * share, -share, 0 * share), 1)
+    return np.outer(cut.below(start), (0, -1, 0))
 
 
 def _sleeve_length(cut: _Cut) -> F64:
     start = 0.7 * abs(cut.joints[16, 0])
     far = np.abs(cut.x[:, 0]).max()
     share = np.clip((np.abs(cut.x[:, 0]) - start) / (far - start), 0, None) ** 1.1
-    return np.stack((np.sign(cut.x[:, 0]) * share, 0 * share, 0 * share), 1)
+    return np.outer(np.sign(cut.x[:, 0]) * share, (1, 0, 0))
 
 
 def _ease(cut: _Cut) -> F64:
@@ -107,9 +109,9 @@ def _ease(cut: _Cut) -> F64:
 
 def _neckline(cut: _Cut) -> F64:
     # Along the cloth, away from the neck: the gradient of the distance from its rim.
-    a, b, c = (cut.topology.mesh.faces[:, k] for k in range(3))
-    x, d = cut.x, cut.from_top
-    normal = np.cross(x[b] - x[a], x[c] - x[a])
+    x, d, faces = cut.x, cut.from_top, cut.topology.mesh.faces
+    a, b, c = faces.T
+    normal = face_normals(x, faces)
     area2 = (normal**2).sum(1, keepdims=True) + 1e-18
     gradient = (
         np.cross(normal, x[c] - x[b]) * d[a, None]
@@ -123,8 +125,7 @@ def _neckline(cut: _Cut) -> F64:
     # A neckline is cut deeper in front than at the back and on the shoulders.
     middle = x[cut.top, 2].mean()
     front = 0.35 + 0.65 * ramp(x[:, 2], middle - 0.01, middle + 0.07)
-    field: F64 = away * (np.exp(-((d / 0.1) ** 2)) * front)[:, None]
-    return field
+    return away * (np.exp(-((d / 0.1) ** 2)) * front)[:, None]
 
 
 def _flare(cut: _Cut) -> F64:
@@ -139,14 +140,11 @@ def _flare(cut: _Cut) -> F64:
         start = cut.x[cut.top, 1].mean()
     away[:, 1] = 0
     away /= np.linalg.norm(away, axis=1, keepdims=True) + 1e-9
-    low = cut.x[cut.bottom, 1].mean()
-    share = np.clip((start - cut.x[:, 1]) / (start - low), 0, None) ** 1.2
-    return cut.smooth(away * share[:, None])
+    return cut.smooth(away * cut.below(start)[:, None])
 
 
 def _rise(cut: _Cut) -> F64:
-    share = np.exp(-((cut.from_top / 0.08) ** 2))
-    return np.stack((0 * share, share, 0 * share), 1)
+    return np.outer(np.exp(-((cut.from_top / 0.08) ** 2)), (0, 1, 0))
 
 
 _FIELDS: dict[str, Callable[[_Cut], F64]] = {
@@ -211,7 +209,7 @@ def build_styles(garment: GarmentTemplate, body: SmplBody) -> dict[str, F32]:
 def main() -> int:
     assets = Path(__file__).parents[1] / "refu_core" / "assets"
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("garments", nargs="*", default=BUILTIN_GARMENTS, help="all of them if none is named")
+    parser.add_argument("garments", nargs="*", default=PAPER_GARMENTS, help="all that have styles if none is named")
     parser.add_argument("--output", type=Path, default=assets, help="folder for the files (default: where they are)")
     args = parser.parse_args()
     torch.set_num_threads(1)

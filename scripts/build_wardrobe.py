@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from asset_tools.cuts import Cut, Neckline, Plane
+from asset_tools.cuts import Neckline, Plane
 from asset_tools.remesh import remesh
 from asset_tools.surfaces import Faces, Vertices, boundary_loops, self_intersections
-from build_garments import Field, area, cut_out, drape, edge_for, keep_clear, ramp
+from build_garments import Pattern, area, cut_out, drape, edge_for, keep_clear, ramp
 
 from refu_core.body import SmplBody, load_body
 from refu_core.fitting import GarmentDetails, Placing, PosedBody, SurfaceMesh, Transfer, fit_garment
@@ -64,17 +64,11 @@ class Measures:
         )
 
 
-@dataclass(frozen=True)
-class Pattern:
+@dataclass(frozen=True, kw_only=True)
+class Garment(Pattern):
     """How one garment is made on one body."""
 
-    cuts: tuple[Cut, ...]
-    ease: Field
-    """Clearance from the body [m], at points (P, 3)."""
-    vertices: int
     details: GarmentDetails
-    flare: Field | None = None
-    """Extra distance from the vertical axis through the body [m], at points (P, 3)."""
     skirt: tuple[float, float] | None = None
     """Heights from and to which the cloth continues, round both legs [m]."""
 
@@ -99,7 +93,7 @@ def _top(m: Measures, low: float, sleeve: float, ease: Callable[..., np.ndarray]
     return {"cuts": (Plane(1, low, 1), Plane(0, -sleeve, 1), Plane(0, sleeve, -1), neckline), "ease": field}
 
 
-def tshirt(m: Measures, color: tuple[float, float, float]) -> Pattern:
+def tshirt(m: Measures, color: tuple[float, float, float]) -> Garment:
     """Falls loosely from the chest; sleeves widen towards their end."""
     sleeve = 0.82 * m.elbow
 
@@ -107,10 +101,10 @@ def tshirt(m: Measures, color: tuple[float, float, float]) -> Pattern:
         wide = ramp(np.abs(p[:, 0]), 0.5 * m.elbow, sleeve)
         return 0.011 + 0.009 * ramp(p[:, 1], m.armpit - 0.07, -0.05), 0.012 + 0.010 * wide
 
-    return Pattern(**_top(m, -0.25, sleeve, ease), vertices=5600, details=_details(1, color, "shoulders"))
+    return Garment(**_top(m, -0.25, sleeve, ease), vertices=5600, details=_details(1, color, "shoulders"))
 
 
-def shirt(m: Measures, color: tuple[float, float, float]) -> Pattern:
+def shirt(m: Measures, color: tuple[float, float, float]) -> Garment:
     """Wide, to be worn over others; sleeves narrow towards the cuff."""
     sleeve = m.wrist - 0.025
 
@@ -118,20 +112,20 @@ def shirt(m: Measures, color: tuple[float, float, float]) -> Pattern:
         narrow = ramp(np.abs(p[:, 0]), m.elbow, sleeve)
         return 0.012 + 0.012 * ramp(p[:, 1], m.armpit - 0.07, -0.05), 0.014 - 0.004 * narrow
 
-    return Pattern(**_top(m, -0.27, sleeve, ease), vertices=7000, details=_details(2, color, "shoulders"))
+    return Garment(**_top(m, -0.27, sleeve, ease), vertices=7000, details=_details(2, color, "shoulders"))
 
 
-def longsleeve(m: Measures, color: tuple[float, float, float]) -> Pattern:
+def longsleeve(m: Measures, color: tuple[float, float, float]) -> Garment:
     """A slim top that follows the body, with sleeves to the wrist."""
 
     def ease(p: Vertices) -> tuple[np.ndarray, np.ndarray]:
         return 0.0085 + 0.003 * ramp(p[:, 1], 0.0, -0.2), np.full(len(p), 0.0085)
 
     top = _top(m, -0.21, m.wrist - 0.01, ease, wide=0.008)
-    return Pattern(**top, vertices=6600, details=_details(1, color, "shoulders"))
+    return Garment(**top, vertices=6600, details=_details(1, color, "shoulders"))
 
 
-def trousers(m: Measures, color: tuple[float, float, float]) -> Pattern:
+def trousers(m: Measures, color: tuple[float, float, float]) -> Garment:
     """Close at the waist, under a shirt; straight legs to the ankle."""
 
     def ease(p: Vertices) -> np.ndarray:
@@ -139,10 +133,10 @@ def trousers(m: Measures, color: tuple[float, float, float]) -> Pattern:
         return 0.0075 + 0.009 * ramp(p[:, 1], -0.28, -0.45) + 0.010 * below
 
     cuts = (Plane(1, -0.085, -1), Plane(1, m.ankle + 0.035, 1))
-    return Pattern(cuts, ease, 5600, _details(0, color, "waist"))
+    return Garment(cuts=cuts, ease=ease, vertices=5600, details=_details(0, color, "waist"))
 
 
-def dress(m: Measures, color: tuple[float, float, float]) -> Pattern:
+def dress(m: Measures, color: tuple[float, float, float]) -> Garment:
     """Short sleeves, close to the waist, wide from the hips down, to the knee."""
     sleeve = 0.55 * m.elbow
 
@@ -154,10 +148,10 @@ def dress(m: Measures, color: tuple[float, float, float]) -> Pattern:
 
     hem = m.knee + 0.05
     top = _top(m, hem, sleeve, ease, wide=0.016)
-    return Pattern(**top, vertices=7400, details=_details(1, color, "shoulders"), flare=flare, skirt=(-0.19, hem))
+    return Garment(**top, vertices=7400, details=_details(1, color, "shoulders"), flare=flare, skirt=(-0.19, hem))
 
 
-WARDROBE: dict[str, tuple[Callable[[Measures, tuple[float, float, float]], Pattern], tuple[float, float, float]]] = {
+WARDROBE: dict[str, tuple[Callable[[Measures, tuple[float, float, float]], Garment], tuple[float, float, float]]] = {
     "tshirt-female": (tshirt, (0.86, 0.62, 0.36)),
     "tshirt-neutral": (tshirt, (0.42, 0.58, 0.50)),
     "shirt-female": (shirt, (0.62, 0.68, 0.80)),
@@ -181,12 +175,12 @@ def main() -> None:
     for name in arguments.garments:
         start = time.perf_counter()
         body = load_body(name.rpartition("-")[2])
-        pattern_of, color = WARDROBE[name]
-        pattern = pattern_of(Measures.of(body), color)
-        v, f = build(pattern, body)
+        garment_of, color = WARDROBE[name]
+        garment = garment_of(Measures.of(body), color)
+        v, f = build(garment, body)
         placing = Placing(unit=1.0, up="y", pose=np.zeros((N_JOINTS, 3)), is_placed=True)
         made = fit_garment(
-            SurfaceMesh(v, f), body, name=name, placing=placing, details=pattern.details, longest_edge=0.05
+            SurfaceMesh(v, f), body, name=name, placing=placing, details=garment.details, longest_edge=0.05
         )
         path = save_garment(made.template, arguments.assets / f"garment_{name}.npz")
         print(
@@ -196,24 +190,24 @@ def main() -> None:
         )
 
 
-def build(pattern: Pattern, body: SmplBody) -> tuple[Vertices, Faces]:
+def build(garment: Garment, body: SmplBody) -> tuple[Vertices, Faces]:
     v, f = body.v_template.double().numpy(), body.faces.numpy()
-    cuts = pattern.cuts
-    if pattern.skirt is not None:  # the cloth leaves the skin above the legs, and goes on from there
-        cuts = (Plane(1, pattern.skirt[0], 1), *cuts[1:])
+    cuts = garment.cuts
+    if garment.skirt is not None:  # the cloth leaves the skin above the legs, and goes on from there
+        cuts = (Plane(1, garment.skirt[0], 1), *cuts[1:])
     v, f = cut_out(v, f, cuts)
-    if pattern.skirt is not None:
-        v, f = continued(v, f, *pattern.skirt)
-    length = edge_for(v, f, pattern.vertices)
+    if garment.skirt is not None:
+        v, f = continued(v, f, *garment.skirt)
+    length = edge_for(v, f, garment.vertices)
     v, f = remesh(v, f, sizing=lambda p: np.full(len(p), length))
-    draped = drape(v, f, pattern, body)  # type: ignore[arg-type]
+    draped = drape(v, f, garment, body)
     # Draping has stretched the mesh: remesh it, for even edges and the right count.
     length *= np.sqrt(area(draped, f) / area(v, f))
     final, faces = remesh(draped, f, sizing=lambda p: np.full(len(p), length))
     transfer = Transfer.of(final, faces, PosedBody(body, np.zeros((N_JOINTS, 3))))
     shaped = (body.rest_vertices(torch.eye(N_BETAS)) - body.v_template).permute(1, 2, 0)
     shapedirs = transfer(shaped.reshape(body.n_vertices, -1).double().numpy(), length=0.03).reshape(-1, 3, N_BETAS)
-    return keep_clear(final, faces, shapedirs, pattern, body), faces  # type: ignore[arg-type]
+    return keep_clear(final, faces, shapedirs, garment, body), faces
 
 
 def continued(v: Vertices, f: Faces, top: float, bottom: float, step: float = 0.012) -> tuple[Vertices, Faces]:

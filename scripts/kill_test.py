@@ -17,13 +17,13 @@ import mmap
 import os
 import random
 import shutil
-import signal
 import struct
 import sys
 import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -244,34 +244,16 @@ def kill_often(what: str, times: int, *, seed: int, folder: Path) -> Result:
     return result
 
 
-def _work_and_exit(work: Any, place: Path) -> None:
-    """Does the work, in the process that may be killed."""
-    status = 1
-    try:
-        place.mkdir(exist_ok=True)
-        work.begin(place)
-        status = 0
-    except Exception as error:
-        sys.stderr.write(f"{type(error).__name__}: {error}\n")
-    finally:
-        os._exit(status)
-
-
 def _status_of(work: Any, place: Path, seconds: float) -> int | None:
     """The exit status of a process that does the work, or None where it didn't end in time and was killed."""
-    child = os.fork()
-    if child == 0:
-        _work_and_exit(work, place)
-    end = time.monotonic() + seconds
-    while True:
-        pid, status = os.waitpid(child, os.WNOHANG)
-        if pid:
-            return os.waitstatus_to_exitcode(status)
-        if time.monotonic() > end:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return None
-        time.sleep(0.002)
+    place.mkdir(exist_ok=True)
+    child = get_context("fork").Process(target=work.begin, args=(place,), daemon=True)
+    child.start()
+    child.join(seconds)
+    status = child.exitcode
+    child.kill()
+    child.join()
+    return status
 
 
 def main() -> int:

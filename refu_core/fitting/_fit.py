@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from refu_core.body import BUILTIN_BODIES, JOINT_NAMES, SmplBody, blend_transforms, load_body, unapply_transforms
 from refu_core.errors import GarmentError, require_type
@@ -249,7 +250,7 @@ def _bound(worn: _Worn, body: SmplBody, name: str, details: GarmentDetails, note
     mesh, notes = worn.mesh, notes + worn.notes
     vertices, posed = mesh.vertices, PosedBody(body, np.zeros((N_JOINTS, 3)))
     transfer = Transfer.of(vertices, mesh.faces, posed)
-    weights = _few(transfer(body.weights.double().numpy(), length=_SKIN_LENGTH))
+    weights = few_influences(transfer(body.weights.double().numpy(), length=_SKIN_LENGTH))
     shaped = body.rest_vertices(torch.eye(N_BETAS)) - body.v_template  # how a unit of each beta moves the skin [m]
     of_skin = shaped.permute(1, 2, 0).reshape(body.n_vertices, -1).double().numpy()
     shapedirs = transfer(of_skin, length=_SHAPE_LENGTH)
@@ -298,17 +299,17 @@ def _outward(mesh: SurfaceMesh, body: PosedBody) -> SurfaceMesh:
 def _unposed(mesh: SurfaceMesh, posed: PosedBody) -> F64:
     """The mesh brought from the pose of a body to its T-pose [m], shape (V, 3)."""
     transfer = Transfer.of(mesh.vertices, mesh.faces, posed)
-    weights = torch.from_numpy(_few(transfer(posed.body.weights.double().numpy(), length=_SKIN_LENGTH)))
+    weights = torch.from_numpy(few_influences(transfer(posed.body.weights.double().numpy(), length=_SKIN_LENGTH)))
     transforms = type(posed.transforms)(*(part.double() for part in posed.transforms))
     points = torch.from_numpy(mesh.vertices)[None]
     return unapply_transforms(points, blend_transforms(weights, transforms))[0].numpy()
 
 
-def _few(weights: F64) -> F64:
-    """The weights of at most six joints per vertex, without negligible ones."""
+def few_influences(weights: F64, least: float = 2e-3) -> F64:
+    """The weights of at most six joints per vertex, without those below the `least`."""
     kept = weights.clip(0).copy()
     np.put_along_axis(kept, np.argsort(-kept, axis=1)[:, _INFLUENCES:], 0.0, axis=1)
-    kept[kept < 2e-3] = 0.0
+    kept[kept < least] = 0.0
     found: F64 = kept / kept.sum(1, keepdims=True)
     return found
 
@@ -334,15 +335,10 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     for _ in range(_ROUNDS):
         distance, away = body(v[ends[asked]].mean(1))
         lacks[asked] = np.maximum(CLEARANCE - distance, 0)[:, None] * away
-        lift, middles = lacks[: len(v)], lacks[len(v) :]
-        order = np.argsort(np.linalg.norm(middles, axis=1))
-        for end in (0, 1):
-            most = np.zeros_like(v)
-            most[edges[order, end]] = middles[order]  # the last one written to a vertex is its longest
-            lift = _larger(lift, most)
+        lift = lift_of(lacks[: len(v)], lacks[len(v) :], edges)
         if np.linalg.norm(lift, axis=1).max() < 1e-4:
             break
-        step = _larger(lift, 0.9 * (adjacent @ lift) / degree)
+        step = larger(lift, 0.9 * (adjacent @ lift) / degree)
         v = v + step
         asked = (step[ends] != 0).any((1, 2))  # what stays where it is lacks what it did
     moved = np.linalg.norm(v - start, axis=1)
@@ -361,7 +357,17 @@ def _cleared(mesh: SurfaceMesh, body: PosedBody, notes: list[str]) -> F64:
     return v
 
 
-def _larger(a: F64, b: F64) -> F64:
+def lift_of(vertices: F64, middles: F64, edges: NDArray[np.integer]) -> F64:
+    """For each vertex the longest of what it lacks (V, 3), and what the middles of its edges (E, 2) lack, (E, 3)."""
+    order = np.argsort(np.linalg.norm(middles, axis=1))
+    for end in (0, 1):
+        most = np.zeros_like(vertices)
+        most[edges[order, end]] = middles[order]  # the last one written to a vertex is its longest
+        vertices = larger(vertices, most)
+    return vertices
+
+
+def larger(a: F64, b: F64) -> F64:
     """Row by row the longer of two vectors."""
     return np.where((np.linalg.norm(a, axis=1) >= np.linalg.norm(b, axis=1))[:, None], a, b)
 

@@ -102,7 +102,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     poses = [placing.pose] if placing.pose is not None else [standing_pose(arms) for arms in _ARMS]
     bodies = [PosedBody(body, pose) for pose in poses]
     turns = turns_of(placing.up, mesh, is_placed=placing.is_placed)
-    in_units = cache(lambda: search.along(bodies, turns, units, scales=False))  # only if it's needed, and once
+    in_units = cache(lambda: search.along(bodies, turns, units))  # only if it's needed, and once
     found = search.by_convention(bodies, turns) if search.has_origin else []
     if placing.is_whole and found and found[0].fit.is_near:
         yield search.told(found[0])
@@ -174,7 +174,7 @@ def find_places(mesh: SurfaceMesh, body: SmplBody, placing: Placing) -> Iterator
     scaled = [one for one in search.best_of(rough, scales=True) if one.fit.is_good]
     yield from map(search.told, scaled)
     order += scaled
-    lying = [] if placing.up or placing.is_placed else search.along(bodies, LYING, units, scales=False)
+    lying = [] if placing.up or placing.is_placed else search.along(bodies, LYING, units)
     least = min((one.cost(extent) for one in (*good, *order)), default=math.inf)
     # Nobody wears a garment on a hand, or upside down, that can be worn upright.
     lying = [one for one in lying if one.fit.is_plain and MISFIT * one.cost(extent) < least]
@@ -271,9 +271,9 @@ class _Search:
     def _worn(self, place: Place) -> tuple[F64, Ints, SmplBody]:
         return place(self._mesh.vertices), self._mesh.faces, self._body
 
-    def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
+    def along(self, bodies: list[PosedBody], turns: list[F64], units: list[float]) -> list[Place]:
         """The best place at any height along the body, refined from there; none if there are no heights."""
-        return self.best_of(self.roughly(bodies, turns, units, scales=scales), scales=scales)
+        return self.best_of(self.roughly(bodies, turns, units, scales=False), scales=False)
 
     def roughly(self, bodies: list[PosedBody], turns: list[F64], units: list[float], *, scales: bool) -> list[Place]:
         """The best place of each turn at any height along the body, the best first."""

@@ -109,18 +109,18 @@ def anchor_kernel(
 
 
 @wp.func
-def ask(p: wp.vec3, is_all: bool, i: int, b: int, skin: LaneSkin, asked: Asked) -> int:
-    """Asks for the skin below point i of lane b, if it has moved too far since it last asked; 0."""
+def ask(p: wp.vec3, is_all: bool, i: int, b: int, skin: LaneSkin, asked: Asked) -> None:
+    """Asks for the skin below point i of lane b, if it has moved too far since it last asked."""
     known = asked.distance[i, b]
     allowed = wp.where(known > skin.near + skin.slide, known - skin.near, skin.slide)
     if not is_all and wp.length_sq(p - asked.at[i, b]) <= allowed * allowed:
-        return 0
+        return
     asked.at[i, b] = p
     hit = wp.mesh_query_point_sign_normal(skin.mesh, p + skin.origin[b], skin.reach, 1.0e-3)
     if not hit.result:
         asked.face[i, b] = -1
         asked.distance[i, b] = skin.reach
-        return 0
+        return
     f = hit.face - b * skin.faces.shape[0]
     w = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
     q, r, s = skin.faces[f, 0], skin.faces[f, 1], skin.faces[f, 2]
@@ -135,22 +135,20 @@ def ask(p: wp.vec3, is_all: bool, i: int, b: int, skin: LaneSkin, asked: Asked) 
     asked.weights[i, b] = w
     asked.distance[i, b] = length * hit.sign
     asked.normal[i, b] = normal
-    return 0
 
 
 @wp.func
-def meet(i: int, b: int, skin: LaneSkin, asked: Asked, contacts: Contacts) -> int:
-    """The contact of point i of lane b, if the skin is near; 0."""
+def meet(i: int, b: int, skin: LaneSkin, asked: Asked, contacts: Contacts) -> None:
+    """The contact of point i of lane b, if the skin is near."""
     f = asked.face[i, b]
     if f < 0 or asked.distance[i, b] >= 2.0 * skin.near:
         contacts.normal[i, b] = wp.vec3(0.0, 0.0, 0.0)
-        return 0
+        return
     w = asked.weights[i, b]
     q, r, s = skin.faces[f, 0], skin.faces[f, 1], skin.faces[f, 2]
     contacts.point[i, b] = w[0] * skin.vertices[b, q] + w[1] * skin.vertices[b, r] + w[2] * skin.vertices[b, s]
     contacts.motion[i, b] = w[0] * skin.motion[b, q] + w[1] * skin.motion[b, r] + w[2] * skin.motion[b, s]
     contacts.normal[i, b] = asked.normal[i, b]
-    return 0
 
 
 @wp.kernel(enable_backward=False)

@@ -77,12 +77,11 @@ def length_kernel(
 
 
 @wp.func
-def push(i: int, b: int, way: wp.vec3, pushes: wp.array3d[wp.int32]) -> int:
-    """Adds to the push of a vertex, in whole numbers; 0."""
+def push(i: int, b: int, way: wp.vec3, pushes: wp.array3d[wp.int32]) -> None:
+    """Adds to the push of a vertex, in whole numbers."""
     wp.atomic_add(pushes, 0, i, b, int(way[0] * FIXED))
     wp.atomic_add(pushes, 1, i, b, int(way[1] * FIXED))
     wp.atomic_add(pushes, 2, i, b, int(way[2] * FIXED))
-    return 0
 
 
 @wp.kernel(enable_backward=False)

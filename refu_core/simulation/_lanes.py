@@ -100,14 +100,9 @@ class ClothLanes:
         vectors = {name: self._new(n, lanes, 3) for name in ("at", "weights", "normal")}
         return {"face": face, "distance": self._new(n, lanes), **vectors}
 
-    @property
-    def n_lanes(self) -> int:
-        """Number of lanes."""
-        return len(self._origin)
-
     def _prepare(self, anchored: I32, body_faces: I32) -> None:
         """Makes the launches of a frame, which are the same in every frame."""
-        s, topology, lanes, n = self._settings, self._topology, self.n_lanes, len(self._x)
+        s, topology, lanes, n = self._settings, self._topology, len(self._origin), len(self._x)
         vec3, device, faces = wp.vec3, self._device, ints(self._topology.mesh.faces, self._device)
         h, step = s.substep, 1 / s.substeps
         x, v, previous, rest, searched = (

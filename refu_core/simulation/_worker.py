@@ -152,11 +152,10 @@ class SlotSimulator(Simulator):
             pose, clip, frame = self.tried(slot, attempt)
             drape = self.draper.drape(pose, betas, style)
             cause, taken = self.judged(drape, pose, betas)
-            if cause is not None:
-                dropped[CAUSES.index(cause)] += 1
-                continue
-            row |= taken | {"pose": pose, "clip": clip, "frame": frame}
-            break
+            if cause is None:
+                row |= taken | {"pose": pose, "clip": clip, "frame": frame}
+                break
+            dropped[CAUSES.index(cause)] += 1
         else:
             row["state"] = GIVEN_UP
         return row | {"dropped": dropped, "seconds": time.perf_counter() - start}

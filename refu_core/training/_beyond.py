@@ -14,7 +14,7 @@ from refu_core.body import SmplBody
 from refu_core.errors import RefuError, printable
 from refu_core.garments import GarmentTemplate
 from refu_core.training import _data as data
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, seeded, start_parallel
 from refu_core.training._loss import code_loss
 from refu_core.training._rehearsal import Rehearsal
 
@@ -79,8 +79,7 @@ def train_beyond(
     # With both signs the mean is zero, so that nothing can be added.
     mean, components = data.principal_components(torch.cat((owed[0], -owed[0])), rank=settings.rank)
     decoder = nets.BasisDecoder(torch.zeros_like(mean), components)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.loop.seed)
+    with seeded(settings.loop.seed):
         beyond = nets.Beyond(kind, nets.BeyondConfig(known.config.joints), decoder)
     rehearsed = rehearsal.of(card_of_known, known, known=opened.plans)
     rehearsed = rehearsed.take(who(rehearsed.pose))

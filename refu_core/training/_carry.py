@@ -25,7 +25,7 @@ from refu_core.garments import N_STYLES, GarmentTemplate, load_garment, worn_on
 from refu_core.modes import SdfMode
 from refu_core.simulation import random_pose
 from refu_core.training import _data as data
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, seeded
 from refu_core.training._loss import code_loss
 from refu_core.weights import load_weights, save_weights, weights_folder
 
@@ -162,8 +162,7 @@ def carry_over(
     nets.save_basis(output, basis, {**described, "set": opened.n_slots})
 
     config = nets.TailorNetConfig(template.card.joints, low=settings.hidden, high=(), style_shape=(), dropout=0.0)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.loop.seed)
+    with seeded(settings.loop.seed):
         model = nets.build_backbone(config, template, basis=basis, pivots=torch.zeros(1, N_BETAS + N_STYLES))
     assert isinstance(model, nets.TailorNet)
     with torch.no_grad():  # the low-frequency net learns it all

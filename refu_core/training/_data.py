@@ -19,6 +19,7 @@ from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import N_STYLES, GarmentTemplate, SkinBelow, load_garment
 from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, dequantise, open_dataset
+from refu_core.training._loop import seeded
 from refu_core.training._mirror import Mirror as Mirror
 from refu_core.training._mirror import SurfaceMixture as SurfaceMixture
 from refu_core.training._mirror import mirror_pose as mirror_pose
@@ -129,7 +130,7 @@ class TrainingSet:
 
     @property
     def n_slots(self) -> int:
-        """Rows of all sets, finished or not."""
+        """Finished rows of all sets."""
         return sum(map(len, self.sets))
 
     @property
@@ -285,8 +286,7 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
     rank = min(rank, n - 1)
     mean = values.mean(0)
     centred = (values - mean).flatten(1)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
+    with seeded(0):
         # Randomised: an exact decomposition takes 7 s for 3,000 samples and, growing with the cube, minutes for 12,000.
         _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=4)
     return mean, components[:, :rank].T.contiguous()

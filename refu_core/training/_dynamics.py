@@ -28,7 +28,7 @@ from refu_core.history import PoseHistory
 from refu_core.simulation import GarmentSequences
 from refu_core.training import _data as data
 from refu_core.training._carry import Carried, CarrySettings, borne_out, own_codes
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, seeded, start_parallel
 from refu_core.training._loss import code_loss
 
 
@@ -98,8 +98,7 @@ def train_dynamics(
     settings = settings or DynamicsSettings()
     torch_device = start_parallel(device)
     if like is None:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(settings.loop.seed)
+        with seeded(settings.loop.seed):
             dynamics = Dynamics(DynamicsConfig(still.config.joints), still)
     else:
         dynamics = _carried(like, still, samples, template, body)

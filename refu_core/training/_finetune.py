@@ -17,7 +17,7 @@ from refu_core.modes import DEFAULT_MARGIN
 from refu_core.refu import SCALE_PRESETS, Refu, ScaleKind, refu_tensors
 from refu_core.training import _data as data
 from refu_core.training._dresser import Dresser, Sdf, refu_loss
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, seeded, start_parallel
 from refu_core.training._pretrain import PretrainSettings, basis_of, bring_basis, pivots_of, stages
 from refu_core.weights import load_weights
 
@@ -101,6 +101,7 @@ def finetune(
     """
     if mode not in _MODES:
         raise RefuError(f"no mode {mode!r} of training: wanted {', '.join(FINETUNE_MODES)}")
+    in_refu, in_loss, least = _MODES[mode]
     settings = settings or FinetuneSettings.of(backbone, preset)
     opened = data.TrainingSet.of(garment, datasets, body)
     template, body, samples, identity = opened.garment, opened.body, opened.samples, opened.identity
@@ -110,8 +111,7 @@ def finetune(
     if settings.is_mirrored:
         train = data.with_mirrored(train, data.Mirror.of(template))
     network: nets.Network
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.loop.seed)
+    with seeded(settings.loop.seed):
         if weights is None:
             config = nets.backbone_config(backbone, template, preset=preset)
             basis = basis_of(output, opened, None, PretrainSettings().rank) if nets.uses_basis(config, preset) else None
@@ -122,10 +122,9 @@ def finetune(
             stored = load_weights(Path(weights) / f"{backbone}-none", expect=identity)
             network = nets.backbone_from_weights(stored, template)
             bring_basis(Path(weights), output, written=stem.name)
-        refu = _layer(mode, settings, template.n_vertices)
+        refu = None if least is None else _layer(least, settings, template.n_vertices)
     described = {**identity, "backbone": backbone, "preset": preset, "mode": mode, "settings": asdict(settings)}
     described |= {"samples": len(train), "from_scratch": weights is None}
-    in_refu, in_loss, _ = _MODES[mode]
     garment, there = template.to(device=torch_device), body.to(device=torch_device)
     dresser = Dresser(network, refu, garment, there, in_refu, in_loss, is_blended=settings.is_blended)
     loop = Loop(dresser, settings.loop, stem, described, torch_device, quiet=quiet)
@@ -162,10 +161,7 @@ def _tensors(samples: data.TrainingSamples, body: SmplBody, garment: GarmentTemp
     return *inputs, whole
 
 
-def _layer(mode: str, settings: FinetuneSettings, n_vertices: int) -> Refu | None:
-    least = _MODES[mode][2]
-    if least is None:
-        return None
+def _layer(least: float, settings: FinetuneSettings, n_vertices: int) -> Refu:
     if settings.scale is not None and settings.scale not in SCALE_PRESETS:
         msg = f"no preset {settings.scale!r} of the scale networks: wanted {', '.join(SCALE_PRESETS)} or None"
         raise RefuError(msg)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
@@ -104,9 +105,7 @@ class Loop:
             return
         rank, world = ranks()
         cuda = [self._device] if self._device.type == "cuda" else []
-        # The caller's random numbers stay as they were.
-        with torch.random.fork_rng(devices=cuda):
-            torch.manual_seed(self._settings.seed * 1000 + 10 * len(self._done) + rank)
+        with seeded(self._settings.seed * 1000 + 10 * len(self._done) + rank, *cuda):
             self._train(stage, rank, world)
         self._done.append(stage.name)
         self._save(None)
@@ -201,6 +200,14 @@ class Loop:
         if is_writer():
             state = {"identity": self._identity, "done": self._done, "stage": stage, "model": self._model.state_dict()}
             save_checkpoint(self.checkpoint, state)
+
+
+@contextmanager
+def seeded(seed: int, *gpus: torch.device) -> Iterator[None]:
+    """Torch's random numbers from this seed on, also on these GPUs; the caller's stay as they were."""
+    with torch.random.fork_rng(devices=gpus):
+        torch.manual_seed(seed)
+        yield
 
 
 def _gpu_state(device: torch.device) -> dict[str, Tensor]:

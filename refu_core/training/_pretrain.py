@@ -18,7 +18,7 @@ from refu_core.frames import N_JOINTS
 from refu_core.garments import GarmentTemplate
 from refu_core.refu import refu_from_weights, refu_tensors
 from refu_core.training import _data as data
-from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, seeded, start_parallel
 from refu_core.training._loss import VertexError, code_loss, vertex_loss
 from refu_core.training._rehearsal import Rehearsal, plans_of, symmetric
 from refu_core.weights import load_weights
@@ -136,8 +136,7 @@ def pretrain(
         if settings.dropout is not None and isinstance(config, nets.TailorNetConfig):
             config = replace(config, dropout=settings.dropout, high_dropout=2 * settings.dropout)
         basis = basis_of(output, opened, mirror, settings.rank) if nets.uses_basis(config, preset) else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(settings.loop.seed)
+        with seeded(settings.loop.seed):
             model = nets.build_backbone(config, template, basis=basis, pivots=pivots_of(samples, opened.n_pivots))
     else:
         stored = load_weights(Path(start) / f"{backbone}-{mode}", expect=identity)

@@ -16,7 +16,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.sdf import SDF_PRESETS, ExactSdf, SdfNetwork, body_frame, query_batch, save_sdf_network, with_gradient
 from refu_core.simulation import GarmentDataset
 from refu_core.training._data import check_set, drawn_pairs
-from refu_core.training._loop import Loop, LoopSettings, TrainingStage, cosine, is_writer, ranks, start_parallel
+from refu_core.training._loop import Loop, LoopSettings, TrainingStage, cosine, is_writer, ranks, seeded, start_parallel
 
 VALUE_WEIGHT, NORMAL_WEIGHT, EIKONAL_WEIGHT = 2.0, 1.0, 0.1
 """λ_a, λ_b and λ_c of the paper's loss."""
@@ -207,8 +207,7 @@ def train_sdf(
     samplers = {part: SdfSampler(dataset, body, garment, rows) for part, rows in splits.items()}
     checks = {part: _fixed_batch(samplers[part], settings).to(where) for part in ("validation", "test")}
 
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
+    with seeded(settings.seed):
         network = SdfNetwork(SDF_PRESETS[settings.preset])
     about = {"garment": garment.name, "samples": len(splits["train"])}
     identity = [asdict(settings), body.fingerprint, about]

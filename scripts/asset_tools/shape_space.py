@@ -13,6 +13,8 @@ from refu_core.body import JOINT_NAMES, PARENTS
 from refu_core.frames import N_BETAS
 from refu_core.mesh import vertex_areas
 
+PEOPLE = 600
+"""How many are drawn of each gender."""
 PELVIS = np.array([0.0, -0.22, 0.02])
 """Where every T-posed body's pelvis lies [m]."""
 
@@ -158,14 +160,14 @@ class TPose:
         return rotations
 
 
-def build_shape_spaces(mesh: BaseMesh, *, count: int) -> dict[str, ShapeSpace]:
-    """Shape spaces of `count` men, of as many women, and (`neutral`) of all of them."""
+def build_shape_spaces(mesh: BaseMesh) -> dict[str, ShapeSpace]:
+    """Shape spaces of men, of women, and (`neutral`) of all of them."""
     to_tpose = TPose(mesh)
     samples, joints = {}, {}
     for gender in ("male", "female"):
-        people = mesh.people(count, gender=gender)
-        joints[gender] = np.empty((count, len(JOINT_NAMES), 3))
-        for i in range(count):  # in place: a gender's samples are 160 MB
+        people = mesh.people(PEOPLE, gender=gender)
+        joints[gender] = np.empty((PEOPLE, len(JOINT_NAMES), 3))
+        for i in range(PEOPLE):  # in place: a gender's samples are 160 MB
             people[i], joints[gender][i] = to_tpose(people[i])
         samples[gender] = people
     samples["neutral"] = np.concatenate([samples["male"], samples["female"]])
@@ -178,8 +180,7 @@ def _aligning(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.floa
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     x, y, z = np.cross(a, b)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation: NDArray[np.float64] = np.eye(3) + cross + cross @ cross / (1 + a @ b)
-    return rotation
+    return np.eye(3) + cross + cross @ cross / (1 + a @ b)
 
 
 def _about_x(angle: float) -> NDArray[np.float64]:

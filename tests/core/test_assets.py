@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import runpy
+from dataclasses import replace
 from importlib import resources
+from pathlib import Path
 
 import fcl
 import numpy as np
@@ -270,3 +273,20 @@ def test_hems_lie_where_they_should() -> None:
     for name in BUILTIN_GARMENTS:
         hem = min(openings(name), key=lambda p: p[:, 1].mean())
         assert np.ptp(hem[:, 1]) < 5e-3
+
+
+def test_styles_are_made_for_those_garments_that_have_parameters(tmp_path, monkeypatch) -> None:
+    """By default it went on to garments of one style, and failed at the first of them."""
+    path = Path(__file__).parents[2] / "scripts" / "build_styles.py"
+    monkeypatch.syspath_prepend(path.parent)
+    names = runpy.run_path(str(path))["main"].__globals__
+
+    def cut_alone(garment, body) -> dict[str, np.ndarray]:
+        mean, fields = names["tailored"](garment, body)
+        return {"v_template": mean, "styledirs": fields, "tailoring_from_style": np.eye(4)}
+
+    monkeypatch.setitem(names, "build_styles", cut_alone)
+    monkeypatch.setitem(names, "load_garment", lambda name: replace(load_garment(name), styledirs=None))
+    monkeypatch.setattr("sys.argv", [str(path), "--output", str(tmp_path)])
+    assert names["main"]() == 0
+    assert {file.stem for file in tmp_path.iterdir()} == {f"garment_{name}" for name in PAPER_GARMENTS}
