@@ -52,7 +52,6 @@ class Motion(Recording):
     def resampled(self, fps: float) -> Motion:
         """The motion at another frame rate: rotations on the shorter arc, translations along straight lines.
 
-        Components of rotation vectors aren't interpolated: they may jump by 2 pi between frames.
         Raises `MotionFileError` for a rate outside [0.001, 10000], more than a million frames, and where a frame isn't
         finite.
         """

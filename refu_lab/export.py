@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, count, islice
 from os import PathLike
@@ -130,17 +129,14 @@ def export(
     frames, outputs, left_out, n_records = [], [], list[str](), 0
     for number, record in enumerate(islice(source.records, first + count)):
         n_records = number + 1
-        if number < first:  # later frames depend on it: their past, and where keypoints were
-            with suppress(RefuError):
-                source.frame_of(record)
-            continue
         try:
-            frame = source.frame_of(record)
-            outputs.append(source.pipeline(frame))
+            frame = source.frame_of(record)  # of earlier ones, too: what follows depends on their past
+            if number >= first:
+                outputs.append(source.pipeline(frame))
+                frames.append(frame)
         except RefuError as error:
-            left_out.append(f"frame {number} is left out: {error}")
-        else:
-            frames.append(frame)
+            if number >= first:
+                left_out.append(f"frame {number} is left out: {error}")
     if n_records < first + count:
         left_out.append(f"it has {n_records} frames, wanted number {first} to {first + count - 1}")
     warnings = [*source.warnings(), *left_out]

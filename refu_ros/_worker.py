@@ -147,8 +147,7 @@ class Worker:
 
     def _plan(self, gone: list[str], arrivals: Mapping[str, Arrival]) -> _Batch:
         """What there is to do for these people, and with what."""
-        settings = self.settings
-        fittings = self.fittings
+        settings, fittings = self.settings, self.fittings
         if fittings is not self._planned_with:
             self._planned_with, self._is_lost = fittings, False
         if self._told_in != (settings.frame_id, settings.axes):  # nobody has moved: they are only described anew
@@ -274,13 +273,11 @@ class Worker:
         except RefuError as error:
             self._statistics.drop("not_finite", str(error))
 
-    def _remove(self, persons: Iterable[str]) -> None:
+    def _remove(self, persons: list[str]) -> None:
         """Takes persons out of viewers' scenes."""
-        gone = []
         for person in persons:
             self._dressed.pop(person, None)
-            if person in self._here:
-                gone.append(person)
+        gone = [person for person in persons if person in self._here]
         self._here -= {*gone}
         for row in self._outputs if gone else ():
             self._publish(row.gone(gone, self._moment(self.settings)))

@@ -302,8 +302,8 @@ class RunningRecording:
         Raises `BagError` for a path that can't be recorded to; nothing has changed then.
         """
         recorder = Recorder(path, sync_period=self._sync_period, ended=self._ended)
-        self.stop()
-        self._recorder, self._error, self.asked = recorder, "", path
+        self.end()
+        self._recorder, self.asked = recorder, path
         self._logger.info(printable(f"recording to {recorder.path}"))
         return recorder.path
 
@@ -329,19 +329,12 @@ class RunningRecording:
         bag = self.start(path)
         return printable(f"recording to {bag}"), str(bag)
 
-    def stop(self) -> None:
-        """Ends the recording."""
+    def end(self) -> None:
+        """Ends the recording; nobody needs to hear any more of an error in it."""
         recorder, self._recorder, self._error = self._recorder, None, ""
         if recorder is not None:
             recorder.stop()
-            if error := recorder.state().error:  # one that has ended it already
-                self._error = error
             self._closing = [*(one for one in self._closing if not one.finished), recorder]
-
-    def end(self) -> None:
-        """Like `stop`, on request: nobody needs to hear of an error in a recording that isn't wanted any more."""
-        self.stop()
-        self._error = ""
 
     def put(self, topic: str, message_type: str, data: bytes, qos: QosProfile) -> None:
         """Queues a message that was sent or received now."""
@@ -354,10 +347,13 @@ class RunningRecording:
         return state, self._error if state is None else state.error
 
     def close(self) -> None:
-        """Waits until everything is in the files."""
-        self.stop()
+        """Ends the recording, and waits until everything is in the files; why it failed stays told."""
+        last = self._recorder
+        self.end()
         for recorder in self._closing:
             recorder.close()
+        if last is not None:
+            self._error = last.state().error or self._error
 
     def _ended(self, state: RecorderState) -> None:
         if state.error:

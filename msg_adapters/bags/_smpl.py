@@ -68,14 +68,8 @@ class SmplBag:
                 error = cause
             except EncodeError as cause:
                 frame, error = None, DecodeError(f"no stamp, and was received at an impossible time: {cause}")
-            yield FrameRecord(
-                frame=frame,
-                error=error,
-                stamp_ns=frame.stamp_ns if frame else message.log_time_ns,
-                log_time_ns=message.log_time_ns,
-                topic=message.topic,
-                raw=message.data,
-            )
+            stamp_ns = frame.stamp_ns if frame else message.log_time_ns
+            yield FrameRecord(frame, error, stamp_ns, message.log_time_ns, message.topic, message.data)
 
 
 def _listing(topics: Sequence[TopicInfo]) -> str:

@@ -96,23 +96,14 @@ class SqliteFile:
 
     def _topics(self, database: sqlite3.Connection, budget: Budget) -> dict[int, TopicInfo]:
         """The topics by number, without message counts."""
-        wanted = ["name", "type", "serialization_format"]
-        wanted += ["type_description_hash"] * ("type_description_hash" in self._columns["topics"])
+        of_type = "type_description_hash" if "type_description_hash" in self._columns["topics"] else "''"
         definitions = self._texts(database, budget)
         topics: dict[int, TopicInfo] = {}
-        query = f"SELECT id, {', '.join(wanted)} FROM topics LIMIT {_MAX_TOPICS}"
+        query = f"SELECT id, name, type, serialization_format, {of_type} FROM topics LIMIT {_MAX_TOPICS}"
         for number, *values in _rows(database, query, budget, "bytes of declarations"):
-            texts = [value if isinstance(value, str) else "" for value in values]
-            got = dict(zip(wanted, texts, strict=True))
-            kind = full_type_name(got["type"])
-            topics[int(number)] = TopicInfo(
-                name=got["name"],
-                message_type=kind,
-                encoding=got["serialization_format"],
-                message_count=0,
-                definition=definitions.get(kind, ""),
-                type_hash=got.get("type_description_hash", ""),
-            )
+            name, kind, encoding, type_hash = (value if isinstance(value, str) else "" for value in values)
+            kind = full_type_name(kind)
+            topics[int(number)] = TopicInfo(name, kind, encoding, 0, definitions.get(kind, ""), type_hash)
         return topics
 
     def _texts(self, database: sqlite3.Connection, budget: Budget) -> dict[str, str]:

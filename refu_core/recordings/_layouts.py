@@ -214,7 +214,7 @@ HUMANML_ADVICE = "fit SMPL to its joints, or give them as keypoints (docs/guide/
 UNREAD = {
     ("mhr_model_params", "body_pose_params", "lbs_model_params", "identity_coeffs"): "MHR (SAM 3D Body) parameters "
     "aren't read: save pred_keypoints_3d with them, which is read, or convert them with MHR's own tool",
-    ("motion_feats", "new_joint_vecs"): f"HumanML3D features parameters aren't read: {HUMANML_ADVICE}",
+    ("motion_feats", "new_joint_vecs"): f"HumanML3D features aren't read: {HUMANML_ADVICE}",
     ("dof", "dof_pos", "joint_vel", "qpos", "loop_mode", "skeleton_tree"): "the joints of robots and simulated figures "
     "aren't read: give the person's motion that they were retargeted from",
     ("J_regressor",): "a body model's parameters aren't read: it is who wears the garments, and no motion: give it as "

@@ -54,9 +54,8 @@ class PaperStructure:
     On a CPU it takes 2.5 GB for a T-shirt, and seconds a frame.
     """
 
-    def __init__(self, garment: GarmentTemplate, body: SmplBody, *, settings: PaperSettings | None = None) -> None:
+    def __init__(self, garment: GarmentTemplate, body: SmplBody, *, settings: PaperSettings) -> None:
         """Builds it for a garment and its body, on the body's device."""
-        settings = settings or PaperSettings()
         self._dtype = settings.dtype
         self._garment, self._body = garment, body
         backbone = build_backbone(

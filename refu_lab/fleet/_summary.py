@@ -46,10 +46,10 @@ class FleetResult:
         for row in self.rows:
             for warning in row.get("warnings", ()):
                 of.setdefault(warning, []).append(row["name"])
-        lines = [
-            f"{warning} ({names[0]}{f' and {len(names) - 1} others' if len(names) > 1 else ''})"
-            for warning, names in sorted(of.items(), key=lambda item: -len(item[1]))
-        ]
+        lines = []
+        for warning, (first, *others) in sorted(of.items(), key=lambda item: -len(item[1])):
+            beside = f" and {len(others)} other{'s' * (len(others) > 1)}" if others else ""
+            lines.append(f"{warning} ({first}{beside})")
         more = len(lines) - _SHOWN
         return lines if more <= 0 else [*lines[:_SHOWN], f"{more} other warnings: --json names all"]
 

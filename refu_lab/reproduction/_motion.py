@@ -159,21 +159,17 @@ class OutfitJudge:
         )
         self.body = self._skinned.body
         self._collider, self._skin = (metrics.CollisionChecker(self.body.faces) for _ in range(2))
-        self._detector = lru_cache(maxsize=8)(self._make_detector)
+        self._of_shape = lru_cache(maxsize=8)(self._prepared)
         templates = self._skinned.garments
         self._metrics = {name: metrics.GarmentMetrics(one.faces.numpy()) for name, one in templates.items()}
         self._sheets = {name: metrics.SheetChecker(one.faces.numpy()) for name, one in templates.items()}
-        self._lengths = lru_cache(maxsize=64)(self._rest_lengths)
 
-    def _make_detector(self, betas: bytes) -> metrics.SelfContactDetector:
-        """A detector for one shape: which faces cross at rest already (toes) depends on it."""
+    def _prepared(self, betas: bytes) -> tuple[metrics.SelfContactDetector, dict[str, NDArray[np.floating]]]:
+        """What depends on a person's shape: which faces cross at rest already (toes), and each garment's edges."""
         shape = torch.from_numpy(np.frombuffer(betas, np.float32).copy())[None]
-        return metrics.SelfContactDetector(self.body.faces, self.body.rest_vertices(shape)[0])
-
-    def _rest_lengths(self, garment: str, betas: bytes) -> NDArray[np.floating]:
-        template = self._skinned.garments[garment]
-        rest = template.rest(torch.from_numpy(np.frombuffer(betas, np.float32).copy())[None])[0].numpy()
-        return self._edge_lengths(garment, rest)
+        rest = {name: one.rest(shape)[0].numpy() for name, one in self._skinned.garments.items()}
+        detector = metrics.SelfContactDetector(self.body.faces, self.body.rest_vertices(shape)[0])
+        return detector, {name: self._edge_lengths(name, vertices) for name, vertices in rest.items()}
 
     def _edge_lengths(self, garment: str, vertices: NDArray[np.floating]) -> NDArray[np.floating]:
         """Length of each edge [m], shape (E,)."""
@@ -183,34 +179,32 @@ class OutfitJudge:
 
     def judge(self, frames: Sequence[SmplFrame]) -> tuple[dict[tuple[str, str], Judged], NDArray[np.floating]]:
         """Judges the first of two frames, by (garment, method); and how far its skin was moved [m], shape (V,)."""
-        skinned = self._skinned(frames)
-        contact: metrics.SelfContact | None = None
+        skinned, made = self._skinned(frames), {method: one(frames) for method, one in self._pipelines.items()}
+        person = next(iter(made.values()))[0]  # every method has the same body
+        self._collider.update(person.body)
+        self._skin.update(person.skin)
+        detector, lengths = self._of_shape(frames[0].betas.tobytes())
+        contact = detector.detect(person.body)
         judged: dict[tuple[str, str], Judged] = {}
-        for method, pipeline in self._pipelines.items():
-            now, then = pipeline(frames)
-            if contact is None:
-                self._collider.update(now.body)
-                self._skin.update(now.skin)
-                contact = self._detector(frames[0].betas.tobytes()).detect(now.body)
-                way = np.linalg.norm(now.body - now.skin, axis=1)
+        for method, (now, then) in made.items():
             for garment in now:
                 ways = [last[garment].local - first[garment].local for first, last in ((now, then), skinned)]
-                judged[garment, method] = self._judge(garment, now, frames[0], contact, *ways)
-        return judged, way
+                judged[garment, method] = self._judge(garment, now, contact, lengths[garment], *ways)
+        return judged, np.linalg.norm(person.body - person.skin, axis=1)
 
     def _judge(
         self,
         garment: str,
         out: PipelineOutput,
-        frame: SmplFrame,
         contact: metrics.SelfContact,
+        rest_lengths: NDArray[np.floating],
         way: NDArray[np.floating],
         way_of_skinned: NDArray[np.floating],
     ) -> Judged:
         local, faces, sheet = out[garment].local, out[garment].faces, self._sheets[garment]
         sheet.update(local)
         others = [out[name] for name in out if name != garment]
-        stretch = self._edge_lengths(garment, local) / self._lengths(garment, frame.betas.tobytes())
+        stretch = self._edge_lengths(garment, local) / rest_lengths
         return Judged(
             self._metrics[garment].add(local, self._collider.check(local, faces)),
             self._skin.check(local, faces).is_free,

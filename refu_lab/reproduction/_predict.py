@@ -112,7 +112,7 @@ class Predictor:
         drape = dressed.drapes[self._name]
         points = dressed.turns[0](drape.vertices[0])
         ms = {"backbone": 1e3 * (ended["backbone"] - ended["body"])}
-        if self._method.handling == "none" or self._method.sdf is None:
+        if self._method.sdf is None:
             return MethodOutput(points, ms)
         _, update_ms = scene.sdf(self._method.sdf)
         start = time.perf_counter()
@@ -120,8 +120,7 @@ class Predictor:
         if self._refu is not None:
             sample = ask(points)
             ms["sdf"] = update_ms + 1e3 * (time.perf_counter() - start)
-            done, ms["refu"], pushed = self._push(self._refu, scene, points, sample, drape.feature)
-            return MethodOutput(done, ms, *pushed)
+            return self._push(self._refu, scene, points, sample, drape.feature, ms)
         if self._method.handling == "naive":
             done = repulse(points, ask(points))  # onto the skin exactly (paper, Sec. 4.5)
         else:
@@ -132,20 +131,20 @@ class Predictor:
         return MethodOutput(done, ms)
 
     def _push(
-        self, refu: Refu, scene: SampleScene, points: Tensor, sample: SdfSample, z: Tensor | None
-    ) -> tuple[Tensor, float, tuple[Tensor, Tensor, Tensor]]:
-        """ReFU as in training, one push, no second look: the garment, its time [ms], and the rest of the output."""
+        self, refu: Refu, scene: SampleScene, points: Tensor, sample: SdfSample, z: Tensor | None, ms: dict[str, float]
+    ) -> MethodOutput:
+        """ReFU as in training, one push, no second look; its time is added to `ms` [ms]."""
         start = time.perf_counter()
         batch = SdfSample(sample.distance[None], sample.gradient[None])
         pushed = refu(points[None], batch, z)
         if self._method.is_blended:
             pushed = self._setup.blend.follow(points[None], pushed, batch, refu.margin)
-        ms = 1e3 * (time.perf_counter() - start)
+        ms["refu"] = 1e3 * (time.perf_counter() - start)
         rows = torch.nonzero(sample.distance < refu.margin)[:, 0]
         scale, f = refu.of_body(z), sample.distance[rows]
         scales = torch.full_like(f, scale) if isinstance(scale, float) else scale(rows, f)
         exact, _ = scene.sdf("accurate")
-        return pushed[0], ms, (scales, f, exact.query(points[rows]).distance)
+        return MethodOutput(pushed[0], ms, scales, f, exact.query(points[rows]).distance)
 
     def _of_node(self, pipeline: GarmentPipeline, scene: SampleScene) -> MethodOutput:
         frame = SmplFrame(pose=scene.pose[0].numpy(), betas=scene.betas[0].numpy(), style=scene.style[0].numpy())

@@ -19,6 +19,7 @@ from refu_core.frames import N_STYLES
 from refu_core.garments import load_garment
 from refu_core.metrics import CollisionChecker, Figures, FrameMetrics, GarmentMetrics
 from refu_core.simulation import GarmentDataset, GarmentSequences, open_dataset
+from refu_lab.fleet._engine import run_function
 from refu_lab.reproduction._methods import METHODS, Library
 from refu_lab.reproduction._predict import GarmentSetup, MethodOutput, Predictor, SampleScene
 from refu_lab.reproduction._tables import Missing
@@ -230,7 +231,8 @@ def run_methods(
         return
     parts: dict[int, dict[str, list[SampleResult]]] = {}
     with tqdm(total=len(samples), desc=garment, unit="sample", disable=None if progress else True) as bar:
-        for index, part in (engine or InProcess()).run(partial(_runner, *prepared), _Blocks(samples)):
+        make = run_function(partial(_run_samples, *prepared))
+        for index, part in (engine or InProcess()).run(make, _Blocks(samples)):
             if isinstance(part, Lost) or part.keys() != ready.keys():
                 why = part.reason if isinstance(part, Lost) else "a process hasn't the weights that this one has"
                 raise RefuError(f"{garment}: samples {index * _BLOCK} and following are lost: {why}")
@@ -256,13 +258,6 @@ def _prepared(
     return setup, ready, missing
 
 
-def _runner(
-    garment: str, library: Library, methods: tuple[str, ...]
-) -> Callable[[list[Sample]], dict[str, list[SampleResult]]]:
-    setup, ready, _ = _prepared(garment, library, methods)
-    return partial(_run_samples, setup, ready)
-
-
 class _Blocks(Sequence[list[Sample]]):
     """Samples in blocks, read when they are asked for."""
 
@@ -278,8 +273,9 @@ class _Blocks(Sequence[list[Sample]]):
 
 
 def _run_samples(
-    setup: GarmentSetup, predictors: Mapping[str, Predictor], samples: Sequence[Sample]
+    garment: str, library: Library, methods: tuple[str, ...], samples: list[Sample]
 ) -> dict[str, list[SampleResult]]:
+    setup, predictors, _ = _prepared(garment, library, methods)
     faces = setup.template.faces.numpy()
     checker = CollisionChecker(setup.body.faces)
     metrics = {name: GarmentMetrics(faces) for name in predictors}

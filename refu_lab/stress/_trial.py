@@ -61,15 +61,11 @@ class Subject:
             collider=self._collider,
         )
 
-    @property
+    @cached_property
     def one_by_one(self) -> dict[str, GarmentPipeline]:
         """A pipeline for each garment alone: worn together, they would also be lifted off each other."""
         names = self.wardrobe.garments
-        return self._alone if len(names) > 1 else {names[0]: self.pipeline}
-
-    @cached_property
-    def _alone(self) -> dict[str, GarmentPipeline]:
-        return {name: self.load(name) for name in self.wardrobe.garments}
+        return {name: self.load(name) for name in names} if len(names) > 1 else {names[0]: self.pipeline}
 
     @cached_property
     def checker(self) -> CollisionChecker:

@@ -164,6 +164,7 @@ def test_any_rotation_comes_back(seed: int, size: int) -> None:
         ({"poses": POSES, "betas": np.zeros((4, 10))}, "betas must be one row of .*, or a row for each of 30"),
         ({"verts": np.zeros((T, 9, 3))}, "no poses; wanted pose_world, .*; the file has"),
         ({"mhr_model_params": np.zeros((T, 204))}, "MHR .* aren't read: save pred_keypoints_3d"),
+        ({"motion_feats": np.zeros((T, 263))}, "HumanML3D features aren't read: fit SMPL"),
         ({"poses": POSES, "betas": np.full((T, 10), np.inf)}, "betas has values that are NaN or infinite"),
         ({"smpl_poses": POSES, "smpl_scaling": []}, "smpl_scaling must be a number in .*, got"),
         ({"smpl_poses": POSES, "smpl_trans": TRANSL, "smpl_scaling": [0.0]}, "smpl_scaling must be a number in"),

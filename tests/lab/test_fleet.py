@@ -208,6 +208,8 @@ def test_what_there_is_to_warn_of_is_said_of_many_as_of_one() -> None:
         f"warning: {one}" for one in said
     ]
     assert '<p class="warn">z up &lt;is&gt; taken (r0 and 2 others)</p><p class="warn">cm (r1)</p>' in result.page()
+    two = FleetResult(rows=[{"name": f"r{i}", **ROW, "warnings": ["cm"]} for i in range(2)])
+    assert two.warnings() == ["cm (r0 and 1 other)"]
     many = FleetResult(rows=[{"name": "r", **ROW, "warnings": [str(i) for i in range(25)]}])
     assert many.warnings()[-1] == "15 other warnings: --json names all"
 
