@@ -26,10 +26,7 @@ class DynamicsConfig:
 
 
 class Dynamics(nn.Module):
-    """f(θ, β, γ, past) - f(θ, β, γ, 0): zero for a person who stands still, whatever was learnt.
-
-    It has no state, so it can't drift.
-    """
+    """f(θ, β, γ, past) - f(θ, β, γ, 0): zero for a person who stands still. It has no state, so it can't drift."""
 
     def __init__(self, config: DynamicsConfig, still: TailorNet) -> None:
         """`still` is the backbone that this one is added to."""

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from refu_core._cache import remembered
-from refu_core._warp import as_torch, as_warp, ints, memory
+from refu_core._warp import Repeated, as_torch, as_warp, ints, memory
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
 from refu_core.body._aside import Aside
@@ -182,6 +182,9 @@ class Anatomy:
         most = how.gap / max(how.segment_share, 1e-3)  # skin farther away keeps the whole gap
         wp.launch(parting.clearance_kernel, (n, n_segments), [most, points, segments, clearance], device=device)
         segments.gap = self._floats(np.minimum(how.gap, how.segment_share * clearance.numpy()))
+        kinds = (wp.vec3, wp.int32, wp.int32, wp.vec3, wp.float32)
+        self.ask_closest = Repeated(parting.closest_kernel, kinds, [segments])
+        """Finds points' closest faces, and their sides of these, in the pose that the trees were fitted to last."""
         self.bundles = bundled(points.numpy(), solids.faces, self.device)
         self.skins = self._bind_skins(segments.gap.numpy())
         self.own = torch.as_tensor(solids.of_vertex.astype(np.int64), device=self.device)

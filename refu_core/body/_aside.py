@@ -14,7 +14,7 @@ from torch.nn.functional import embedding_bag
 from refu_core._cache import remembered
 from refu_core._warp import Recorded, Repeated, as_warp, ints, is_plain, memory, torch_stream
 from refu_core.body import _aside_kernels as kernels
-from refu_core.body._collider_gradient import weights_at
+from refu_core.body._collider_gradient import weights_at, within
 from refu_core.body._collider_kernels import Means
 from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._model import SmplBody
@@ -104,14 +104,15 @@ class Aside:
             with torch_stream(self._device):
                 self._tree.refit()
         turn, length2, is_of = skin.new_zeros(len(ARMS), 3), (arm * arm).sum(1), self._is_of.to(skin)
-        longest = torch.where(self._is_of, length2.sqrt(), 0.0).amax(1, keepdim=True)
+        longest = torch.where(self._is_of, length2.sqrt(), 0.0).amax(1)
         for _ in range(self._rounds):
             at = (rotvec_to_rotmat(turn)[self._arm] @ arm[..., None])[..., 0]
             out = self._way_out(points, shoulder + at)
             squared = (out * out).sum(1, keepdim=True)
             asked = squared * torch.linalg.cross(at, out) / length2[:, None]
             total = is_of @ squared
-            turn = _within(turn + is_of @ asked / torch.where(total > 0, total, 1.0), self._farthest / longest)
+            turn = turn + is_of @ asked / torch.where(total > 0, total, 1.0)
+            turn = within(turn, torch.zeros_like(turn), self._farthest / longest)
         turns = rotvec_to_rotmat(turn)
         for pivot, by, share, joints in zip(means, turns, self._share.to(skin), self._joints, strict=False):
             skin = skin + share * ((skin - pivot) @ by.T - (skin - pivot))
@@ -202,12 +203,13 @@ def _means_of(rest: Array, weights: Array, joints: Array, mesh: Connectivity, so
         is_hand = weights[:, list(fore[1:])].sum(1) > 0.5
         pieces = _pieces(rest, mesh, is_fore, hand - elbow, _SLICES, is_hand)
         pieces += _pieces(rest, mesh, is_upper, elbow - shoulder, _UPPER_SLICES, is_hand)
-        rows += [piece.vertices for piece in pieces]
-        thumbs += [piece.thumb for piece in pieces]
-        arm += [i] * len(pieces)
+        for members, thumb in pieces:
+            rows.append(members)
+            thumbs.append(thumb)
+            arm.append(i)
     first_cap = len(rows)
-    for some in np.split(solids.middle_vertex, solids.middle_start[1:-1]):
-        rows.append(np.bincount(some, minlength=len(rest)).astype(np.float64))
+    caps = np.split(solids.middle_vertex, solids.middle_start[1:-1])
+    rows += [np.bincount(some, minlength=len(rest)).astype(np.float64) for some in caps]
     row, vertex = np.nonzero(rows)
     weight = np.stack(rows)[row, vertex]
     return _Averaged(
@@ -220,17 +222,13 @@ def _means_of(rest: Array, weights: Array, joints: Array, mesh: Connectivity, so
     )
 
 
-class _Piece(NamedTuple):
-    vertices: Array
-    """1 for those that are in it, else 0, (V,)."""
-    thumb: float
-    """Radius of a piece of a thumb [m], else 0."""
-
-
 def _pieces(
     rest: Array, mesh: Connectivity, is_on: NDArray[np.bool_], along: Array, n_slices: int, is_hand: NDArray[np.bool_]
-) -> list[_Piece]:
-    """Each connected piece of each slice of an arm's part: fingers are separate pieces, thumbs beside the palm."""
+) -> list[tuple[Array, float]]:
+    """Each connected piece of each slice of an arm's part: fingers are separate pieces, thumbs beside the palm.
+
+    Which vertices it has, 1 or 0, (V,), and its radius if it is a thumb's [m], else 0.
+    """
     (on,) = np.nonzero(is_on)
     height = rest[on] @ along
     slices = np.full(len(rest), -1)
@@ -242,16 +240,9 @@ def _pieces(
     radius = [float(np.linalg.norm(rest[some] - rest[some].mean(0), axis=1).mean()) for some in members]
     thick = {slices[some[0]] for some, r in zip(members, radius, strict=True) if r >= _THIN}
     return [
-        _Piece(
+        (
             np.bincount(some, minlength=len(rest)).astype(np.float64),
             r if r < _THIN and slices[some[0]] in thick and is_hand[some].mean() > 0.5 else 0.0,
         )
         for some, r in zip(members, radius, strict=True)
     ]
-
-
-def _within(turn: Tensor, most: Tensor) -> Tensor:
-    """Turns (N, 3) [rad], each limited to an angle of `most` (N, 1)."""
-    squared = (turn * turn).sum(1, keepdim=True)
-    is_far = squared > most**2
-    return torch.where(is_far, most / torch.where(is_far, squared, 1.0).sqrt() * turn, turn)

@@ -25,8 +25,9 @@ from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _step_kernels as steps
 from refu_core.body._anatomy import Anatomy, ColliderSettings
 from refu_core.body._collider_gradient import part_with_gradient
-from refu_core.body._kinematics import PARENTS, RigidTransforms
+from refu_core.body._kinematics import RigidTransforms
 from refu_core.body._model import SmplBody
+from refu_core.skeleton import PARENTS
 
 _DEFAULT = ColliderSettings()
 
@@ -50,10 +51,7 @@ class Collider(Unpicklable):
     """
 
     def __init__(self, body: SmplBody, *, settings: ColliderSettings = _DEFAULT) -> None:
-        """Prepares for a body, on its device, in a tenth of a second.
-
-        Raises `MeshError` for a body that isn't a closed, consistently oriented surface.
-        """
+        """For a body, on its device. Raises `MeshError` unless it is a closed, consistently oriented surface."""
         self.settings, self.anatomy = settings, Anatomy(body, settings)
         self.device = body.device
         self._is_serial = body.device.type == "cpu"

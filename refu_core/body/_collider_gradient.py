@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from refu_core._warp import as_torch, as_warp, memory, torch_stream
+from refu_core._warp import as_torch
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body._creases import LEVELS
-from refu_core.body._kinematics import PARENTS
-from refu_core.body._part_kernels import closest_kernel
+from refu_core.skeleton import PARENTS
 
 if TYPE_CHECKING:
     from refu_core.body._anatomy import Anatomy
@@ -28,7 +26,7 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
     for _ in range(how.crease_rounds):
         p = p + _crease_step(known, skin, p, between, bent)
     is_moved = _is_around(known, (p != skin).any(1))
-    p = _within(p, skin, farthest)
+    p = within(p, skin, farthest)
     p = _smooth(known, skin, p, is_moved, how.smooth_first)
     points = torch.cat((p, _means(known.caps, p)))
     touched = collider.touched(p)
@@ -43,12 +41,12 @@ def part_with_gradient(collider: Collider, skin: Tensor, rotation: Tensor) -> Te
         )
         p = p + _together(step, vertex, len(p))
     is_parted = (p != start).any(1)
-    p = torch.where(is_parted[:, None], _within(p, skin, farthest), p)
+    p = torch.where(is_parted[:, None], within(p, skin, farthest), p)
     p = _smooth(known, skin, p, is_moved | _is_around(known, is_parted), how.smooth_last)
     for _ in range(how.edge_rounds):
         step = _edge_step(known, points, normals, start, p, touched)
         is_raised = (step.detach() != 0).any(1)
-        p = torch.where(is_raised[:, None], _within(p + step, skin, farthest), p)
+        p = torch.where(is_raised[:, None], within(p + step, skin, farthest), p)
     return p
 
 
@@ -60,8 +58,8 @@ def _means(of: Any, points: Tensor) -> Tensor:
     return points.new_zeros(n, 3).index_add(0, owner, points[vertex.long()] * weight.to(points)[:, None])
 
 
-def _within(p: Tensor, skin: Tensor, farthest: Tensor) -> Tensor:
-    """Points (V, 3) [m], each pulled back to within `farthest` (V,) [m] of its skin."""
+def within(p: Tensor, skin: Tensor, farthest: Tensor) -> Tensor:
+    """Points (V, 3), each pulled back to within `farthest` (V,) of its `skin` (V, 3), all [m]."""
     away = p - skin
     squared = (away * away).sum(1, keepdim=True)
     farthest = farthest[:, None]
@@ -113,7 +111,7 @@ def _smooth(known: Anatomy, skin: Tensor, p: Tensor, is_moved: Tensor, sweeps: i
     degree = torch.from_numpy(start).diff().to(p)[:, None]
     for _ in range(sweeps):
         mean = torch.zeros_like(p).index_add(0, owner, p[torch.from_numpy(ring).long()]) / degree
-        p = torch.where(is_moved[:, None], _within(p + share * (mean - p), skin, around), p)
+        p = torch.where(is_moved[:, None], within(p + share * (mean - p), skin, around), p)
     return p
 
 
@@ -164,14 +162,9 @@ def _closest(known: Anatomy, points: Tensor, segment: Tensor) -> tuple[Tensor, T
 
     The face (N,), -1 for none near; the weights of its corners (N, 3); and the sign of the distance (N,), -1 inside.
     """
-    n, device = len(points), points.device
-    face = torch.zeros(n, dtype=torch.int32, device=device)
-    weights, sign = memory(n, 3, device=device), memory(n, device=device)
-    asked = as_warp(points.float().contiguous(), wp.vec3), as_warp(segment.int(), wp.int32)
-    outputs = [as_warp(face, wp.int32), as_warp(weights, wp.vec3), as_warp(sign, wp.float32)]
-    if n:
-        with torch_stream(device):
-            wp.launch(closest_kernel, n, [*asked, known.segments], outputs, device=str(device))
+    points, segment = points.float().contiguous(), segment.int()
+    face, weights, sign = torch.zeros_like(segment), torch.zeros_like(points), torch.zeros_like(points[:, 0])
+    known.ask_closest((len(points),), points, segment, face, weights, sign)
     return face.long(), weights, sign
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from refu_core.body._kinematics import PARENTS
 from refu_core.frames import N_JOINTS
+from refu_core.skeleton import PARENTS
 
 _SHARED = 22
 """Joints that the models have in common: all but SMPL's two hands."""

@@ -38,17 +38,18 @@ def load_body(
         return SmplBody(_builtin(str(source)), name=str(source), device=device, dtype=dtype)
     require_type(source, (str, PathLike), "a body's name or path", error=BodyError)
     path = Path(source)
-    if not path.suffix and not path.is_dir():
-        msg = f"no body {str(source)!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or the path of an .npz or .pkl file"
-        raise BodyError(msg)
+    kind = path.suffix.lower()
     if path.is_dir():
         raise BodyError(f"{path} is a folder: wanted a body model in it, as {path / 'SMPL_FEMALE.pkl'}")
-    if path.suffix.lower() not in (".npz", ".pkl"):
+    if not kind:
+        msg = f"no body {str(source)!r}: wanted one of {', '.join(BUILTIN_BODIES)}, or the path of an .npz or .pkl file"
+        raise BodyError(msg)
+    if kind not in (".npz", ".pkl"):
         msg = f"{path}: a body model must be an .npz or an official .pkl file, got {path.suffix!r}"
-        if path.suffix.lower() in _MESHES:
+        if kind in _MESHES:
             msg += ": a mesh or a scan has no joints and no shapes; fit SMPL to it and give SMPL's own file"
         raise BodyError(msg)
-    read = read_npz if path.suffix.lower() == ".npz" else read_smpl_pickle
+    read = read_npz if kind == ".npz" else read_smpl_pickle
     data = read(path, keys=_KEYS + _TELLING, error=BodyError, wanted=_WANTED)
     return SmplBody(BodyArrays.from_mapping(data, source=str(path)), name=path.stem, device=device, dtype=dtype)
 

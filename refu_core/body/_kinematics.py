@@ -13,8 +13,7 @@ from torch import Tensor
 from refu_core._warp import Repeated, is_plain
 from refu_core.body._pose_kernels import UP_STEP, chain_kernel, rotation_kernel
 from refu_core.errors import FrameError, require_type
-from refu_core.skeleton import JOINT_NAMES as JOINT_NAMES
-from refu_core.skeleton import PARENTS as PARENTS
+from refu_core.skeleton import PARENTS
 
 
 def require_batch(

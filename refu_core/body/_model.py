@@ -17,10 +17,11 @@ from torch import Tensor
 from refu_core._device import checked_device, without_autocast
 from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.body._fingers import without_fingers
-from refu_core.body._kinematics import PARENTS, RigidTransforms, forward_kinematics, require_batch, rotvec_to_rotmat
+from refu_core.body._kinematics import RigidTransforms, forward_kinematics, require_batch, rotvec_to_rotmat
 from refu_core.body._skinning import Skinning
 from refu_core.errors import BodyError, FrameError
 from refu_core.frames import N_BETAS, N_JOINTS
+from refu_core.skeleton import PARENTS
 
 N_POSE_FEATURES = 9 * (N_JOINTS - 1)
 _LARGEST = 1e6
@@ -98,10 +99,8 @@ class BodyArrays:
 
         def require(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
             if array.shape != shape or not n:
-                msg = (
-                    f"{source}: {name} must have the shape {shape}, got {array.shape}{_shape_hint(array.shape, shape)}"
-                )
-                raise BodyError(msg)
+                hint = _shape_hint(array.shape, shape)
+                raise BodyError(f"{source}: {name} must have the shape {shape}, got {array.shape}{hint}")
 
         require("v_template", v_template, (n, 3))
         shapedirs, faces = numbers("shapedirs"), np.atleast_1d(numbers("f"))
@@ -244,27 +243,18 @@ class SmplBody:
         return SmplBody(self.arrays, name=self.name, device=device or self.device, dtype=dtype or self.dtype)
 
     def _batch(self, name: str, value: ArrayLike | Tensor, width: tuple[int, ...]) -> Tensor:
-        given = _tensor(name, value, self.device)
-        if given.is_complex():
-            raise FrameError(f"{name} must be real numbers, got {given.dtype}")
-        tensor = given.to(self.dtype)
+        tensor = _tensor(name, value, self.device).to(self.dtype)
         if tensor.shape[1:] not in (width, (math.prod(width),)) or tensor.ndim < 2:
             raise FrameError(f"{name} must have the shape (B, {', '.join(map(str, width))}), got {tuple(tensor.shape)}")
         return tensor.reshape(-1, *width)
 
     def rest_joints(self, betas: Tensor) -> Tensor:
-        """Joints of the unposed shapes [m], shape (B, 24, 3), for betas (B, 10).
-
-        Raises `FrameError` for anything but such a tensor.
-        """
+        """Joints of the unposed shapes [m], (B, 24, 3), of betas (B, 10). Raises `FrameError` for another tensor."""
         require_batch("betas", betas, (N_BETAS,))
         return self.joint_template + torch.einsum("jck,bk->bjc", self._joint_shapedirs, betas)
 
     def rest_vertices(self, betas: Tensor) -> Tensor:
-        """Unposed bodies without pose blend shapes [m], shape (B, V, 3), for betas (B, 10).
-
-        Raises `FrameError` for anything but such a tensor.
-        """
+        """Unposed bodies without pose blend shapes [m], (B, V, 3), of betas (B, 10). Raises as `rest_joints`."""
         require_batch("betas", betas, (N_BETAS,))
         return torch.addmm(self.v_template.view(1, -1), betas, self._shapedirs).view(-1, self.n_vertices, 3)
 
@@ -316,14 +306,16 @@ class SmplBody:
 
 
 def _tensor(name: str, value: ArrayLike | Tensor, device: torch.device) -> Tensor:
-    """A tensor on `device`; arrays are copied, since a frame's are read-only."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    try:
-        array = as_numbers(value, also="c")  # torch knows no foreign byte order, and no negative strides
-        if np.ma.is_masked(value):
-            raise ValueError("with masked values")
-        return torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C")).to(device)
-    except NOT_NUMBERS as error:
-        got = f"{type(value).__name__}: {error}"
-        raise FrameError(f"{name} must be an array or tensor of numbers, got {got}") from error
+    """A tensor of real numbers on `device`; arrays are copied, since a frame's are read-only."""
+    if not isinstance(value, Tensor):
+        try:
+            array = as_numbers(value, also="c")  # torch knows no foreign byte order, and no negative strides
+            if np.ma.is_masked(value):
+                raise ValueError("with masked values")
+            value = torch.from_numpy(array.astype(array.dtype.newbyteorder("="), order="C"))
+        except NOT_NUMBERS as error:
+            got = f"{type(value).__name__}: {error}"
+            raise FrameError(f"{name} must be an array or tensor of numbers, got {got}") from error
+    if value.is_complex():
+        raise FrameError(f"{name} must be real numbers, got {value.dtype}")
+    return value.to(device)

@@ -258,10 +258,7 @@ def raise_edge(
     bones: Bones,
     steep: float,
 ) -> None:
-    """Finds how the midpoint of a hot edge gives way.
-
-    It does so where the ends' moves differ by more than `steep` [m], in full from twice that on.
-    """
+    """Finds how a hot edge's midpoint gives way; it does where the ends' moves differ by more than `steep` [m]."""
     v = rings.ends[e][0]
     w = rings.ends[e][1]
     # If neither end moved in the last round, the edge gives way as before.
@@ -314,9 +311,9 @@ def follow(v: int, rounds: int, work: Work, moved: wp.array[wp.vec3], rings: Rin
 
 @wp.kernel
 def closest_kernel(
+    segments: Segments,
     points: wp.array[wp.vec3],
     which: wp.array[int],
-    segments: Segments,
     # outputs
     face: wp.array[int],
     corners: wp.array[wp.vec3],

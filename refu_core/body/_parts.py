@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 from torch import Tensor
 
-from refu_core.body._kinematics import JOINT_NAMES
+from refu_core.skeleton import JOINT_NAMES
 
 Joints = tuple[int, ...]
 

@@ -17,12 +17,12 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from refu_core.body._io import load_body
-from refu_core.body._kinematics import JOINT_NAMES
 from refu_core.body._model import SmplBody
 from refu_core.body._parts import joints_of
 from refu_core.body._surface import OnSurface, Surface
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.mesh import Connectivity, symmetric_solver, vertex_normals
+from refu_core.skeleton import JOINT_NAMES
 
 Array = NDArray[np.float64]
 

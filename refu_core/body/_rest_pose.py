@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from refu_core.body._kinematics import JOINT_NAMES
 from refu_core.body._model import BodyArrays, SmplBody
 from refu_core.body._parts import part_of_faces
 from refu_core.body._segments import SOFTNESS
 from refu_core.errors import BodyError, MeshError
 from refu_core.mesh import Connectivity
+from refu_core.skeleton import JOINT_NAMES
 
 _TALL = (0.3, 2.2)
 """Least and greatest distance from ankles to neck [m]: children and giants."""

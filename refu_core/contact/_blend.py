@@ -36,11 +36,7 @@ class Blend:
 
     @classmethod
     def of_faces(cls, faces: Tensor, n_vertices: int) -> Blend:
-        """For garments of these `faces`, shape (G, 3), and `n_vertices` N.
-
-        Raises:
-            MeshError: A face that names a vertex that doesn't exist.
-        """
+        """For garments of `faces` (G, 3) and `n_vertices` N. Raises `MeshError` for a face that names no vertex."""
         ring = Connectivity.of(faces.cpu(), n_vertices).ring
         number = np.diff(ring.start)[:, None]
         return cls(

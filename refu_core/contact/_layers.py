@@ -69,7 +69,12 @@ class Layer(Unpicklable):
         data.start, data.near = (ints(one, self.device) for one in starts)
         for name in ("looks", "found", "moved", "reached", "is_reached"):
             setattr(data, name, wp.zeros(n, dtype=wp.int32, device=str(self.device)))
-        self._commands = self._recorded(data, _rules(settings, rest_below[self._below.mesh.edges], asks_tree))
+        rules = kernels.LayerRules()
+        rules.gap, rules.reach, rules.alike = settings.gap, settings.layer_reach, settings.alike
+        first, second = rest_below[self._below.mesh.edges.T]
+        rules.longest = float(np.linalg.norm(first - second, axis=1).max(initial=0.0))
+        rules.asks_tree = asks_tree
+        self._commands = self._recorded(data, rules)
 
     @torch.no_grad()
     def __call__(self, above: Tensor, below: Tensor, *, goes_on: bool = False) -> tuple[Tensor, Tensor]:
@@ -114,15 +119,6 @@ class Layer(Unpicklable):
             "move all": (kernels.move_all_kernel, 1, [data, self._settings.around]),
         }
         return {name: Recorded(*launch, self.device) for name, launch in launches.items()}
-
-
-def _rules(settings: ContactSettings, edges: NDArray[np.float32], asks_tree: bool) -> Any:
-    """The rules for a sheet whose edges have these ends at rest [m], (E, 2, 3)."""
-    rules = kernels.LayerRules()
-    rules.gap, rules.reach, rules.alike = settings.gap, settings.layer_reach, settings.alike
-    rules.asks_tree = asks_tree
-    rules.longest = float(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1).max(initial=0.0))
-    return rules
 
 
 @remembered(4)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from refu_core.sdf._closest_kernels import closest_on_face, mean_normal
+from refu_core.sdf._closest_kernels import area_normal, closest_on_face
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,7 +14,7 @@ STRANGER = wp.constant(-2)
 
 @wp.struct
 class Cut:
-    """A garment's mesh, which doesn't change."""
+    """A mesh, which doesn't change."""
 
     faces: wp.array2d[wp.int32]
     fan_start: wp.array[wp.int32]
@@ -85,8 +85,11 @@ class LayerRules:
 
 @wp.func
 def normal_at(v: int, points: wp.array[wp.vec3], cut: Cut) -> wp.vec3:
-    """Unit normal of a garment's vertex."""
-    return mean_normal(v, points, cut.faces, cut.fan_start, cut.fan_face)
+    """Unit normal at a vertex, its faces weighted by area."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for k in range(cut.fan_start[v], cut.fan_start[v + 1]):
+        total += area_normal(cut.fan_face[k], points, cut.faces)
+    return wp.normalize(total)
 
 
 @wp.func
@@ -172,7 +175,7 @@ def is_within(p: wp.vec3, extent: wp.array[wp.vec3], room: float) -> bool:
 
 @wp.kernel
 def normals_kernel(points: wp.array[wp.vec3], cut: Cut, normals: wp.array[wp.vec3]) -> None:
-    """Unit normals of a garment's vertices."""
+    """`normal_at` each vertex."""
     v = wp.tid()
     normals[v] = normal_at(v, points, cut)
 

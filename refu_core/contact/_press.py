@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -25,16 +26,18 @@ _LIMBS = (joints_of("trunk", "head"), *ARMS, LEGS[0] + LEGS[1])
 class LimbMeshes(Unpicklable):
     """The limbs of one posed body, each a mesh of its own, shared by all garments on it."""
 
-    def __init__(self, body: SmplBody) -> None:
-        """For poses of this body, on its device."""
+    def __init__(self, body: SmplBody, limbs: Collection[tuple[int, ...]] = _LIMBS) -> None:
+        """For poses of this body, on its device; each of the limbs is given by its joints."""
         self._device = str(body.device)
         self._vertices = memory(*body.v_template.shape, device=body.device).copy_(body.v_template)
-        self._is_late = np.zeros(len(_LIMBS), np.bool_)
+        self._is_late = np.zeros(len(limbs), np.bool_)
         points = as_warp(self._vertices, wp.vec3)
-        limb_of = part_of_faces(body.weights, body.faces, _LIMBS).cpu().numpy()
+        limb_of = part_of_faces(body.weights, body.faces, limbs).cpu().numpy()
         faces = body.faces.cpu().numpy()
-        of_limbs = [faces[limb_of == k].astype(np.int32) for k in range(len(_LIMBS))]
+        of_limbs = [faces[limb_of == k].astype(np.int32) for k in range(len(limbs))]
         self.meshes = [wp.Mesh(points, ints(one.ravel(), self._device)) for one in of_limbs]
+        self.trees = wp.array([mesh.id for mesh in self.meshes], dtype=wp.uint64, device=self._device)
+        """The meshes as kernels take them."""
         self.bundles = bundled(body.v_template.cpu().numpy(), of_limbs, body.device)
         """Boxes around their faces that are close together."""
         self._fit = [
@@ -98,13 +101,12 @@ class Press(Unpicklable):
         } | dict.fromkeys(("boxed", "near", "in_front", "rows"), np.zeros(n))
         for name, values in lists.items():
             setattr(fabric, name, ints(values, self.device))
-        self._meshes = wp.array([mesh.id for mesh in limbs.meshes], dtype=wp.uint64, device=str(self.device))
         beside = garment.edge_length if knows_arms else settings.limb_reach / 2
         self._commands = self._launches(fabric, beside)
 
     def _launches(self, fabric: Any, beside: float) -> dict[str, Any]:
         """The recorded steps, by name: cloth feels limbs up to `beside` [m] to its side."""
-        settings, meshes, n = self._settings, self._meshes, len(self._points)
+        settings, meshes, n = self._settings, self._limbs.trees, len(self._points)
         feel = kernels.Feel()
         feel.room, feel.lies, feel.beside = settings.gap, settings.limb_reach, beside
         sweeps, near = settings.around, settings.near

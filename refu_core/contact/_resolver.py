@@ -70,11 +70,7 @@ class Resolver(Unpicklable):
     def __init__(
         self, faces: Tensor | NDArray[Any], n_vertices: int, *, settings: ContactSettings = DEFAULT_CONTACT
     ) -> None:
-        """For garments of these `faces`, shape (G, 3), and `n_vertices` N, on the device of the faces.
-
-        Raises:
-            MeshError: a face that names a vertex that doesn't exist.
-        """
+        """For garments of `faces` (G, 3) on their device. Raises `MeshError` for a face beyond `n_vertices` N."""
         self._settings = settings
         self.device = faces.device if isinstance(faces, Tensor) else torch.device("cpu")
         mesh = Connectivity.of(faces, n_vertices)
@@ -245,10 +241,10 @@ class Resolver(Unpicklable):
             return
         self._close(_state.CUTTING)
         for round_ in range(self._settings.max_pushes):
-            self._run("measure" if round_ == 0 else f"again{round_ % 2}", (4, round_))
+            self._run(f"measure{round_}")
             self._close(_state.CUTTING + 1 + round_)
             self._counts[_state.RAISED].zero_()
-            self._run(f"choose{round_ % 2}", (2, round_))
+            self._run(f"choose{round_}")
             self._length(_state.RAISED)
             self._run("lift")
 
@@ -260,15 +256,12 @@ class Resolver(Unpicklable):
         return self._n_vertices
 
     def _close(self, which: int) -> None:
-        self._run("close", (1, which))
+        self._run(f"close{which}")
 
     def _count(self, which: int) -> int:
         return int(self._read_counts[which])
 
-    def _run(self, name: str, parameter: tuple[int, int] | None = None) -> None:
-        """Launches a step; `parameter` is the position and new value of one of its parameters."""
-        if parameter is not None:
-            self._commands[name].set_argument(*parameter)
+    def _run(self, name: str) -> None:
         self._commands[name].launch()
 
     def _launches(self, skin: Any, margin: float) -> dict[str, Any]:
@@ -307,25 +300,17 @@ class Resolver(Unpicklable):
         steps["spread0"] = (_round_kernels.spread_kernel, [state, cloth, long_step, state.field, state.smoother])
         steps["spread1"] = (_round_kernels.spread_kernel, [state, cloth, short_step, state.smoother, state.field])
         steps["lift"] = (_round_kernels.lift_kernel, [state, skin, rules])
-        low, lower = self._low
-        of_edges: dict[str, tuple[Any, list[Any]]] = {
-            name: (_round_kernels.measure_kernel, [state, cloth, skin, rules, 0, source, target])
-            for name, source, target in (
-                ("measure", state.suspects, low),
-                ("again1", low, lower),
-                ("again0", lower, low),
-            )
-        }
-        for name, source in (("choose0", low), ("choose1", lower)):
-            of_edges[name] = _round_kernels.choose_kernel, [state, cloth, 0, source]
-        return {
-            "close": Recorded(_round_kernels.close_kernel, 1, [state, 0], self.device),
-            **{name: Recorded(kernel, n, inputs, self.device) for name, (kernel, inputs) in steps.items()},
-            **{
-                name: Recorded(kernel, self._n_edges, inputs, self.device)
-                for name, (kernel, inputs) in of_edges.items()
-            },
-        }
+        launches = {name: (kernel, n, inputs) for name, (kernel, inputs) in steps.items()}
+        source = state.suspects
+        for k in range(how.max_pushes):
+            low = self._low[k % 2]
+            inputs = [state, cloth, skin, rules, k, source, low]
+            launches[f"measure{k}"] = _round_kernels.measure_kernel, self._n_edges, inputs
+            launches[f"choose{k}"] = _round_kernels.choose_kernel, self._n_edges, [state, cloth, k, low]
+            source = low
+        for k in range(len(self._counts)):
+            launches[f"close{k}"] = _round_kernels.close_kernel, 1, [state, k]
+        return {name: Recorded(*launch, self.device) for name, launch in launches.items()}
 
 
 ASKED_FROM = 2e-3

@@ -122,10 +122,7 @@ def bound_kernel(fold: Fold, most: float) -> None:
 
 @wp.kernel
 def unfold_all_kernel(fold: Fold, fade: float, reach: int, rounds: int, most: float) -> None:
-    """All steps after `fold_kernel`, by one thread: for vertices that have folded over and those `reach` edges around.
-
-    `rounds` is even.
-    """
+    """All steps after `fold_kernel`, by one thread, up to `reach` edges around what has folded; `rounds` is even."""
     for r in range(fold.count[0]):
         fold.is_listed[fold.rows[r]] = 1
     n = gather(fold.count[0], reach, fold.cut, fold.rows, fold.is_listed)

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, Unpicklable, as_warp, memory, torch_stream
+from refu_core._warp import Recorded, Repeated, Unpicklable, as_warp, memory, torch_stream
 from refu_core.contact import _way_out_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import Sheet
@@ -22,17 +22,18 @@ class WayOut(Unpicklable):
     """
 
     def __init__(self, skin: Sheet, *, settings: ContactSettings = DEFAULT_CONTACT) -> None:
-        """For poses of this `skin`, on its device.
-
-        Raises `MeshError` when it isn't a closed, consistently oriented surface.
-        """
+        """For poses of this `skin`, on its device. Raises `MeshError` unless it is closed and consistently oriented."""
         self._skin, self._settings, self.device = skin, settings, skin.vertices.device
         self._is_serial = self.device.type == "cpu"
         self._winding = Winding(torch.as_tensor(skin.mesh.faces, device=self.device))
         n_places = len(skin.vertices) + len(skin.mesh.faces)
         self._above = memory(n_places, 3, device=self.device)
-        inputs = [settings.tolerance, skin.data.points, skin.data.cut, as_warp(self._above, wp.vec3)]
+        above, known = as_warp(self._above, wp.vec3), skin.data
+        inputs = [settings.tolerance, known.points, known.cut, above]
         self._lift = Recorded(kernels.above_kernel, n_places, inputs, self.device)
+        fixed = [known.tree, settings.max_displacement, known.points, known.cut.faces, above]
+        kinds = (wp.int32, wp.vec3, wp.int32, wp.vec3, wp.vec3)
+        self._nearest = [Repeated(kernels.nearest_kernel, kinds, [*fixed, of_samples]) for of_samples in (False, True)]
 
     def update(self) -> None:
         """Takes over the pose that the skin has taken."""
@@ -90,14 +91,7 @@ class WayOut(Unpicklable):
         `above` is what `_winding_above` says of the samples; with `of_samples` only the samples themselves are taken.
         """
         foot, normal = points.new_zeros(2, len(points), 3)
-        points, asked = points.contiguous(), is_inside.int()
-        skin, farthest = self._skin.data, self._settings.max_displacement
-        inputs = [skin.tree, farthest, skin.points, skin.cut.faces]
-        inputs += [as_warp(self._above, wp.vec3), as_warp(above, wp.int32), of_samples]
-        inputs += [as_warp(points, wp.vec3), as_warp(asked, wp.int32)]
-        outputs = [as_warp(foot, wp.vec3), as_warp(normal, wp.vec3)]
-        with torch_stream(self.device):
-            wp.launch(kernels.nearest_kernel, len(points), inputs, outputs, device=str(self.device))
+        self._nearest[of_samples]((len(points),), above, points.contiguous(), is_inside.int(), foot, normal)
         return foot, normal
 
 

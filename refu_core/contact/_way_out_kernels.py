@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from refu_core.contact._layers_kernels import Cut
-from refu_core.sdf._closest_kernels import area_normal, closest_on_triangle, mean_normal
+from refu_core.contact._layers_kernels import Cut, normal_at
+from refu_core.sdf._closest_kernels import area_normal, closest_on_triangle
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,7 +32,7 @@ def above_kernel(
     i = wp.tid()
     f = i - body.shape[0]
     if f < 0:
-        places[i] = body[i] + lift * mean_normal(i, body, cut.faces, cut.fan_start, cut.fan_face)
+        places[i] = body[i] + lift * normal_at(i, body, cut)
     else:
         places[i] = body_at(i, body, cut.faces) + lift * wp.normalize(area_normal(f, body, cut.faces))
 
@@ -44,8 +44,8 @@ def nearest_kernel(
     body: wp.array[wp.vec3],
     faces: wp.array2d[int],
     above: wp.array[wp.vec3],
-    winding_above: wp.array[int],
     of_samples: bool,
+    winding_above: wp.array[int],
     points: wp.array[wp.vec3],
     is_inside: wp.array[int],
     # outputs

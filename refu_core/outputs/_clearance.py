@@ -32,10 +32,7 @@ class Clearance:
     reach = REACH
 
     def __init__(self, body: SmplBody, garments: Mapping[str, GarmentTemplate]) -> None:
-        """For garments on a body. Everything is on the CPU, where a pipeline's outputs are.
-
-        Raises `MeshError` for anything else.
-        """
+        """For garments on a body, on the CPU, as a pipeline's outputs are. Raises `MeshError` for anything else."""
         require_outfit(body, garments)
         self._sdf = BandSdf(body.faces.cpu(), band=self.reach, rest=body.v_template.detach().cpu())
         self._rings = {name: garment.mesh.ring for name, garment in garments.items()}

@@ -57,10 +57,7 @@ class Fittings:
     """What is computed once for a pipeline's garments and its body, when it is first asked for."""
 
     def __init__(self, pipeline: GarmentPipeline, *, weights: str | os.PathLike[str] | None = None) -> None:
-        """For a pipeline, and the folder of weights that it was loaded with, if any.
-
-        Raises `MeshError` for no pipeline.
-        """
+        """For a pipeline and the `weights` that it was loaded with, if any. Raises `MeshError` for no pipeline."""
         require_pipeline(pipeline, "garments", "body", error=MeshError)
         self.pipeline, self._weights = pipeline, weights
         self.garments = pipeline.garments

@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import NDArray
 
 from refu_core._warp import Unpicklable, as_warp, ints, memory
-from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody, part_of_faces
+from refu_core.body import DEFAULT_GAP, SEGMENTS, SmplBody
+from refu_core.contact import LimbMeshes
 from refu_core.errors import MeshError, require_pipeline
 from refu_core.garments import GarmentTemplate
 from refu_core.mesh import vertex_areas
@@ -53,20 +55,14 @@ class LimbContacts(Unpicklable):
         """For garments on a body, on the CPU. Raises `MeshError` for anything else."""
         require_outfit(body, garments)
         self._faces = {name: garment.faces.cpu().numpy() for name, garment in garments.items()}
-        self._points, self._shift = memory(2, body.n_vertices, 3)
-        self._points.copy_(body.v_template.detach())
-        part = part_of_faces(body.weights.cpu(), body.faces.cpu(), list(SEGMENTS.values())).numpy()
-        faces = body.faces.cpu().numpy().astype(np.int32)
-        own = [faces[part == k] for k in range(len(_PARTS))]
-        points = as_warp(self._points, wp.vec3)
-        self._meshes = [wp.Mesh(points, ints(one.ravel(), "cpu")) for one in own]
-        parts = kernels.Parts()
-        parts.mesh = wp.array([mesh.id for mesh in self._meshes], dtype=wp.uint64, device="cpu")
-        parts.face_start = ints(np.cumsum([0, *map(len, own)]), "cpu")
-        parts.face = ints(np.concatenate(own).ravel(), "cpu")
-        parts.low, parts.high = (wp.zeros(len(_PARTS), dtype=wp.vec3, device="cpu") for _ in range(2))
-        parts.points, parts.shift = points, as_warp(self._shift, wp.vec3)
-        self._parts = parts
+        self._limbs = LimbMeshes(body.to(device="cpu"), SEGMENTS.values())
+        self._shift = memory(body.n_vertices, 3)
+        self._parts = parts = kernels.Parts()
+        parts.mesh, parts.shift = self._limbs.trees, as_warp(self._shift, wp.vec3)
+        parts.low, parts.high = self._limbs.bundles.group_low, self._limbs.bundles.group_high
+        corners = [mesh.indices.numpy() for mesh in self._limbs.meshes]
+        parts.start = ints(np.cumsum([0, *map(len, corners)]), "cpu")
+        parts.corner = ints(np.concatenate(corners), "cpu")
 
     @classmethod
     def of(cls, pipeline: GarmentPipeline) -> LimbContacts:
@@ -75,17 +71,12 @@ class LimbContacts(Unpicklable):
         return cls(pipeline.body, pipeline.garments)
 
     def __call__(self, output: PipelineOutput) -> tuple[LimbContact, ...]:
-        """The contacts in an output of the pipeline, the one of the largest area first.
-
-        Raises `MeshError` for anything but an output, and for an output with other garments.
-        """
+        """The contacts in an output, those of large area first. Raises `MeshError` for no output, or other garments."""
         require_worn(output, self._faces)
-        body = output.body
-        self._points.numpy()[:] = body
-        self._shift.numpy()[:] = body - output.skin
-        for mesh in self._meshes:
-            mesh.refit()
-        wp.launch(kernels.box_kernel, len(_PARTS), [self._parts], device="cpu")
+        body, skin = (torch.tensor(one, device="cpu") for one in (output.body, output.skin))
+        self._shift.copy_(body - skin)
+        self._limbs.update(body)
+        self._limbs.pose(-1)
         found = [self._pressed(garment.local, self._faces[name]) for name, garment in output.items()]
         pairs, rows = map(np.concatenate, zip(*found, strict=True))
         contacts = [_contact(int(pair), rows[pairs == pair]) for pair in np.unique(pairs)]

@@ -8,29 +8,14 @@ class Parts:
     """A posed body in parts, each a mesh of its own; P parts."""
 
     mesh: wp.array[wp.uint64]
-    face_start: wp.array[wp.int32]
-    """Where each part's faces begin in `face`, shape (P + 1,)."""
-    face: wp.array[wp.int32]
-    """Three vertices of each face, for all parts one after another."""
+    start: wp.array[wp.int32]
+    corner: wp.array[wp.int32]
+    """The vertices of part k's faces are `corner[start[k]:start[k + 1]]`, three a face."""
     low: wp.array[wp.vec3]
     high: wp.array[wp.vec3]
     """Corners of each part's box [m]."""
-    points: wp.array[wp.vec3]
-    """The body's vertices [m]."""
     shift: wp.array[wp.vec3]
-    """How far each of them has left the skin [m]."""
-
-
-@wp.kernel(enable_backward=False)
-def box_kernel(parts: Parts) -> None:
-    """The bounding box of each part, in the body's pose."""
-    k = wp.tid()
-    low, high = wp.vec3(1.0e9), wp.vec3(-1.0e9)
-    for i in range(3 * parts.face_start[k], 3 * parts.face_start[k + 1]):
-        p = parts.points[parts.face[i]]
-        low, high = wp.min(low, p), wp.max(high, p)
-    parts.low[k] = low
-    parts.high[k] = high
+    """How far each vertex of the body has left the skin [m]."""
 
 
 @wp.struct
@@ -61,18 +46,12 @@ def beside(p: wp.vec3, parts: Parts, within: float, other: int, facing: wp.vec3,
         if k != other and to_box(p, parts, k) < found.distance:
             query = wp.mesh_query_point_no_sign(parts.mesh[k], p, found.distance)
             if query.result:
-                f = 3 * (parts.face_start[k] + query.face)
-                a = parts.face[f]
-                b = parts.face[f + 1]
-                c = parts.face[f + 2]
-                u = query.u
-                v = query.v
-                w = 1.0 - u - v
-                normal = wp.normalize(wp.cross(parts.points[b] - parts.points[a], parts.points[c] - parts.points[a]))
-                place = u * parts.points[a] + v * parts.points[b] + w * parts.points[c]
-                distance = wp.length(p - place)
+                normal = wp.mesh_eval_face_normal(parts.mesh[k], query.face)
+                distance = wp.length(p - wp.mesh_eval_position(parts.mesh[k], query.face, query.u, query.v))
                 if distance < found.distance and (other < 0 or wp.dot(normal, facing) < opposed):
-                    shift = u * parts.shift[a] + v * parts.shift[b] + w * parts.shift[c]
+                    i = parts.start[k] + 3 * query.face
+                    shift = query.u * parts.shift[parts.corner[i]] + query.v * parts.shift[parts.corner[i + 1]]
+                    shift += (1.0 - query.u - query.v) * parts.shift[parts.corner[i + 2]]
                     found.part = k
                     found.distance = distance
                     found.normal = normal

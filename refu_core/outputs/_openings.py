@@ -195,10 +195,7 @@ class Openings:
     """
 
     def __init__(self, garment: GarmentTemplate) -> None:
-        """For any garment, the project's or a user's own; one without a boundary has no openings.
-
-        Raises `MeshError` for anything else, such as a mesh that it is worn as.
-        """
+        """For any garment; one without a boundary has no openings. Raises `MeshError` for anything else."""
         require_garment(garment)
         rest = garment.v_template.detach().cpu().double().numpy()
         self._n_vertices = len(rest)

@@ -113,10 +113,7 @@ class ContactStage:
         }
 
     def update(self, body: Tensor) -> None:
-        """Takes over the body's new pose, shape (V, 3) [m].
-
-        Raises `MeshError` for a body that isn't finite.
-        """
+        """Takes over the body's new pose (V, 3) [m]. Raises `MeshError` for a body that isn't finite."""
         self._body, self._skin_of = body, {}
         self.sdf.update(body)
         self._skin.take(body)

@@ -13,7 +13,7 @@ from refu_core.body import RigidTransforms, require_batch
 from refu_core.errors import FrameError, MeshError, RefuError, require_type
 from refu_core.frames import LAGS, N_JOINTS, N_PAST
 from refu_core.realtime._turn import RootTurn
-from refu_core.realtime._wearer import UnposedGarment, Wearable, Wearer
+from refu_core.realtime._wearer import Wearable, Wearer
 from refu_core.refu import VertexScale
 from refu_core.sdf import require_finite, require_tensor
 
@@ -82,10 +82,19 @@ def dress(
             lap("collider", None)
         drapes, seen = {}, pose if up is None else upright(pose, up)
         for name, garment in wearer.garments.items():
-            drape = _drape(seen, past, wearer, outfit.wearables[name], garment, posed.transforms)
+            wearable = outfit.wearables[name]
+            style = wearable.template.own(wearer.style)
+            told = {"past": past} if past is not None and wearable.backbone.heeds_past else {}
+            predicted = wearable.backbone(garment.betas, seen, style, wearer_code=garment.code, **told)
+            unposed, on_mean = garment.rest, garment.on_mean
+            if predicted is not None:
+                displacement = wearable.size * predicted.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
+                unposed, on_mean = unposed + displacement, on_mean + displacement
+            vertices = wearable.template.pose(unposed, posed.transforms)
             if outfit.collider is not None:
-                drape = drape._replace(vertices=drape.vertices + outfit.below[name](body - posed.vertices))
-            drapes[name] = drape
+                vertices = vertices + outfit.below[name](body - posed.vertices)
+            z = None if wearable.refu is None else wearable.refu.feature(garment.betas, seen, style)
+            drapes[name] = Drape(vertices, unposed, on_mean, z)
             lap("backbone", name)
         return Dressed(body, posed.vertices, aside, drapes, turns, posed.transforms)
 
@@ -131,24 +140,3 @@ def _require_like(
 def scale_of(wearable: Wearable, drape: Drape, person: int) -> float | VertexScale:
     """α of one of the persons, as `refu_core.contact` takes it."""
     return 1.0 if wearable.refu is None or drape.feature is None else wearable.refu.of_body(drape.feature[person])
-
-
-def _drape(
-    pose: Tensor,
-    past: Tensor | None,
-    wearer: Wearer,
-    wearable: Wearable,
-    garment: UnposedGarment,
-    transforms: RigidTransforms,
-) -> Drape:
-    style = wearable.template.own(wearer.style)
-    told = {"past": past} if past is not None and wearable.backbone.heeds_past else {}
-    predicted = wearable.backbone(garment.betas, pose, style, wearer_code=garment.code, **told)
-    unposed, on_mean = garment.rest, garment.on_mean
-    if predicted is not None:
-        displacement = wearable.size * predicted.clamp(-MAX_OFFSET, MAX_OFFSET).to(unposed)
-        unposed, on_mean = unposed + displacement, on_mean + displacement
-    z = None
-    if wearable.refu is not None:
-        z = wearable.refu.feature(garment.betas, pose, style)
-    return Drape(wearable.template.pose(unposed, transforms), unposed, on_mean, z)

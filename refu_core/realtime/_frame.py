@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._warp import side_by_side
-from refu_core.body import Collider
 from refu_core.errors import MeshError
 from refu_core.realtime._contact import N_NUMBERS, ContactStage, Worn
 from refu_core.realtime._dress import Dressed, dress, require_adjusted, scale_of
@@ -102,7 +101,9 @@ class FrameStep:
             shared.lap("adjust")
         margin_of = dict(zip(self.outfit.wearables, margins, strict=True))
         persons = []
-        shifts = _shift(dressed, self.outfit.collider)
+        shifts = dressed.body.new_zeros(len(pose), N_SHIFT)
+        if self.outfit.collider is not None:
+            shifts = self.outfit.collider.shift(dressed.skin, dressed.aside, dressed.body)
         for person, (body, skin, turn) in enumerate(zip(dressed.body, dressed.skin, dressed.turns, strict=True)):
             clock = clocks[person] if clocks else StageClock()
             clock.start(shared, share=1 / len(pose))
@@ -181,10 +182,3 @@ def packed_by(steps: Sequence[FrameStep], inputs: Mapping[str, Tensor], margins:
         for step, part in zip(steps, parts, strict=False)
     ]
     return torch.cat(side_by_side(works, inputs["pose"].device))
-
-
-def _shift(dressed: Dressed, collider: Collider | None) -> Tensor:
-    """The numbers of each person's `SkinShift`, shape (B, 4)."""
-    if collider is None:
-        return dressed.body.new_zeros(len(dressed.body), N_SHIFT)
-    return collider.shift(dressed.skin, dressed.aside, dressed.body)

@@ -37,11 +37,8 @@ def load_outfit(
     if body is not None and betas_from is not None:
         msg = "a body and betas_from were both given: a body file's betas are its own already, leave betas_from out"
         raise BodyError(msg)
-    fit: BodyFit | None = None
-    if body is not None:
-        fit = load_fit(body, device=device)
-    elif betas_from is not None:
-        fit = load_fit(betas_from, betas_from=True, device=device)
+    named = betas_from if body is None else body
+    fit = None if named is None else load_fit(named, betas_from=body is None, device=device)
     wearer = load_body(_cut_for(templates), device=device) if fit is None else fit.body
     wearables = {}
     for name, template in templates.items():

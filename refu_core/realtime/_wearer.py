@@ -122,8 +122,8 @@ class Wearer:
                 rest = one.template.rest(betas, own)
                 on_mean = one.template.rest(mean, own).expand_as(rest)
                 garments[name] = UnposedGarment(rest, on_mean, one.backbone.wearer_code(known, own), known)
-            given = betas.new_zeros(len(betas), N_STYLES) if style is None else style
-            return cls(outfit, betas, given, outfit.body.shape(betas), garments)
+            gamma = betas.new_zeros(1, N_STYLES) if style is None else style
+            return cls(outfit, betas, gamma.expand(len(betas), -1), outfit.body.shape(betas), garments)
 
     @classmethod
     def of_tensors(cls, outfit: Outfit, tensors: Mapping[str, Tensor]) -> Wearer:

@@ -86,17 +86,6 @@ def face_normal(face: int, mesh: PosedMesh) -> wp.vec3:
 
 
 @wp.func
-def mean_normal(
-    vertex: int, points: wp.array[wp.vec3], faces: wp.array2d[int], fan_start: wp.array[int], fan_face: wp.array[int]
-) -> wp.vec3:
-    """Unit normal at a vertex of any mesh, its faces weighted by area."""
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(fan_start[vertex], fan_start[vertex + 1]):
-        total += area_normal(fan_face[k], points, faces)
-    return wp.normalize(total)
-
-
-@wp.func
 def vertex_normal(vertex: int, mesh: PosedMesh) -> wp.vec3:
     """Sum of the normals of the faces around a vertex, weighted by their angles there (Baerentzen and Aanaes, 2005)."""
     here = mesh.points[vertex]

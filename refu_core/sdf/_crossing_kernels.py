@@ -56,10 +56,7 @@ def pierces(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> 
 
 @wp.func
 def is_beside(normal: wp.vec3d, origin: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d) -> bool:
-    """Whether triangle pqr is on one side of a plane for certain.
-
-    In most pairs whose boxes overlap, one triangle is on one side of the other's plane.
-    """
+    """Whether triangle pqr is on one side of a plane for certain, as one is in most pairs whose boxes overlap."""
     least = APART * (wp.abs(normal[0]) + wp.abs(normal[1]) + wp.abs(normal[2]))
     height_p = wp.dot(normal, p - origin)
     height_q = wp.dot(normal, q - origin)

@@ -9,6 +9,7 @@ line slips between two faces, or crosses both.
 import warp as wp
 
 from refu_core.body._bundle_kernels import greater, lesser
+from refu_core.sdf._crossing_kernels import double
 
 # Contracted multiply-adds would round a x b and b x a differently.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -26,13 +27,6 @@ def cell_along(x: float, low: float, per_metre: float) -> int:
 
 
 @wp.func
-def difference(p: wp.vec3, q: wp.vec3) -> wp.vec3d:
-    return wp.vec3d(
-        wp.float64(p[0]) - wp.float64(q[0]), wp.float64(p[1]) - wp.float64(q[1]), wp.float64(p[2]) - wp.float64(q[2])
-    )
-
-
-@wp.func
 def turns(a: wp.vec3d, b: wp.vec3d) -> int:
     """1 if an edge from a to b passes the z axis at +x towards +y, -1 towards -y, else 0; each end counts once."""
     rises = a[1] <= _ZERO
@@ -47,12 +41,12 @@ def turns(a: wp.vec3d, b: wp.vec3d) -> int:
 @wp.func
 def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, half: int) -> int:
     """What a face adds to the winding number of p, which looks along +z, or along -z in the other half."""
-    to_a = difference(a, p)
-    normal = wp.cross(difference(b, a), difference(c, a))
+    to_a = double(a) - double(p)
+    normal = wp.cross(double(b) - double(a), double(c) - double(a))
     ahead = wp.dot(normal, to_a) * normal[2]
     if (half == 0 and ahead > _ZERO) or (half == 1 and ahead < _ZERO):
-        to_b = difference(b, p)
-        to_c = difference(c, p)
+        to_b = double(b) - double(p)
+        to_c = double(c) - double(p)
         passes = turns(to_a, to_b) + turns(to_b, to_c) + turns(to_c, to_a)
         return wp.where(half == 0, passes, -passes)
     return 0
@@ -76,10 +70,7 @@ def extent_kernel(
     # output, which is infinite before
     grid: wp.array[wp.vec3],
 ) -> None:
-    """The corners of the box around the points; `each` points a thread.
-
-    Like all of these kernels it does nothing where `wanted` is 0.
-    """
+    """The corners of the box around the points. Like all of these kernels it does nothing where `wanted` is 0."""
     if wanted[0] == 0:
         return
     begin = wp.tid() * each[0]

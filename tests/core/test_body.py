@@ -183,6 +183,7 @@ def test_up_does_not_tell_the_heading_and_has_derivatives() -> None:
         (np.zeros((1, 72), complex), None, None, "pose must be real numbers, got torch.complex128"),
         (np.zeros((1, 72)), np.zeros((1, 11)), None, r"betas must have the shape \(B, 10\)"),
         (np.zeros((3, 72)), np.zeros((2, 10)), None, r"betas must have the shape \(3, 10\)"),
+        (np.zeros((1, 72)), None, np.zeros((1, 3), complex), "transl must be real numbers, got torch.complex128"),
         (np.zeros((3, 72)), None, np.zeros((3, 2)), r"transl must have the shape \(3, 3\)"),
     ],
 )

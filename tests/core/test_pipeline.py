@@ -438,6 +438,11 @@ def test_tensors_of_other_shapes_are_named(
         dress(pose, None)  # type: ignore[arg-type]
 
 
+def test_one_style_is_that_of_everybody(pipeline: GarmentPipeline) -> None:
+    two = Wearer.of(pipeline.outfit, torch.zeros(2, 10), torch.zeros(1, 4))
+    assert {len(tensor) for tensor in Wearer.together([two, two]).tensors().values()} == {4}
+
+
 def test_a_processor_has_no_number_and_no_other_name() -> None:
     assert GarmentPipeline.load("tshirt-male", device="cpu:0").body.device == torch.device("cpu")
     with pytest.raises(RefuError, match="no device 'gpu': wanted cpu or cuda"):
