@@ -61,11 +61,15 @@ class Subject:
             collider=self._collider,
         )
 
-    @cached_property
+    @property
     def one_by_one(self) -> dict[str, GarmentPipeline]:
         """A pipeline for each garment alone: worn together, they would also be lifted off each other."""
         names = self.wardrobe.garments
-        return {name: self.load(name) for name in names} if len(names) > 1 else {names[0]: self.pipeline}
+        return self._alone if len(names) > 1 else {names[0]: self.pipeline}
+
+    @cached_property
+    def _alone(self) -> dict[str, GarmentPipeline]:
+        return {name: self.load(name) for name in self.wardrobe.garments}
 
     @cached_property
     def checker(self) -> CollisionChecker:
