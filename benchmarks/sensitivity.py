@@ -117,10 +117,10 @@ class ColliderBench:
             (skin, apart), (skin_, apart_) = (self._apart(collider, pose) for pose in (first, second))
             went = np.linalg.norm(apart_ - apart, axis=1) - 1.5 * np.linalg.norm(skin_ - skin, axis=1)
             leaps.append(went.max())
+        free_with_noise = [self._is_free(self._apart(collider, pose)[1]) for pose in self.noisy]
         return {
             "free_percent": 100 * float(np.mean(free)),
-            "free_with_noise_percent": 100
-            * float(np.mean([self._is_free(self._apart(collider, pose)[1]) for pose in self.noisy])),
+            "free_with_noise_percent": 100 * float(np.mean(free_with_noise)),
             "median_shift_mm": 1e3 * float(np.median(shift)),
             "largest_shift_mm": 1e3 * float(np.max(shift)),
             "moved_percent": 100 * float(np.mean(moved)),

@@ -59,7 +59,7 @@ def _means(of: Any, points: Tensor) -> Tensor:
 
 
 def within(p: Tensor, skin: Tensor, farthest: Tensor) -> Tensor:
-    """Points (V, 3), each pulled back to within `farthest` (V,) of its `skin` (V, 3), all [m]."""
+    """Points (V, 3), each pulled back to within `farthest` (V,) of its `skin` (V, 3), all [m]; or turns, all [rad]."""
     away = p - skin
     squared = (away * away).sum(1, keepdim=True)
     farthest = farthest[:, None]
