@@ -53,7 +53,7 @@ class ColliderSettings:
     aside_farthest: float = 0.14
     """No arm moves aside by more than this [m]. Recorded people take half of it. With noise of 8° on each coordinate
     of a joint, as of a poor pose estimate, 91 % of colliders are free; with 70 mm 84 %, with 280 mm 92 %."""
-    aside_rounds: int = 3
+    aside_rounds: int = 4
     """Newton steps that bring an arm out of the body."""
     crease_rounds: int = 3
     """How often skin is brought to its side of the seams: at the groin several of them meet. With two rounds faces

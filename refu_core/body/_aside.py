@@ -1,4 +1,4 @@
-"""Moves arms that are inside the body aside, before skin gives way."""
+"""Moves arms that are inside the body, or each other, aside, before skin gives way."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from refu_core._cache import remembered
-from refu_core._warp import Recorded, Repeated, as_warp, ints, is_plain, memory, torch_stream
+from refu_core._warp import Recorded, Repeated, as_warp, ints, is_plain, memory, refit
 from refu_core.body import _aside_kernels as kernels
 from refu_core.body._collider_gradient import weights_at, within
 from refu_core.body._collider_kernels import Means
@@ -20,6 +20,7 @@ from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._model import SmplBody
 from refu_core.body._parts import ARMS, joints_of, part_of_faces
 from refu_core.body._segments import SOFTNESS, Solids, cut
+from refu_core.body._skinning import solved
 from refu_core.mesh import Connectivity, linked
 
 Array = NDArray[np.float64]
@@ -37,21 +38,25 @@ _THIN = 0.02
 are about as long, and goes out as far beyond the surface as it was inside, until it is wholly out. Of 1,152 tops on
 other studios' motion, 15 weren't free of the body without this; 8 aren't."""
 _TINY = 1e-18  # added to a square [m²]
+_DAMPING = 0.25
+"""Of the squared levers: no middle by itself then turns an arm farther than its depth over its lever, even where the
+way out is along the arm: s / (s² + 1/4) is at most 1, s being the sine of the angle between the two."""
 _FOREARMS = (joints_of("left_forearm"), joints_of("right_forearm"))
 _UPPER_ARMS = (joints_of("left_upper_arm"), joints_of("right_upper_arm"))
 
 
 class Aside:
-    """Swings arms about their shoulders until no middle of an arm, palm, finger or thumb is inside the body.
+    """Swings arms about their shoulders until no middle of an arm, palm, finger or thumb is inside the body or an arm.
 
     Flesh gives way to what dents it, but not to what is wholly inside: the two sides of a hand would move apart, and
     the skin around it has no reason to move at all. Cloth around a hip would have to go through the arm. A part whose
     middle is outside is inside by half of its thickness at most, so it is a dent. Only a thumb bores a hole narrower
     than the cloth's triangles, so it goes farther out.
 
-    Each middle that is inside asks for the least turn that brings it to the surface, and deep ones count most. So arms
-    move continuously, and where no middle is inside, nothing moves. The exception is an arm that is half-way through
-    the trunk or a thigh: there the nearest way out changes sides, and the arm leaps.
+    Each middle that is inside asks its arm to turn until it is at the surface, or both arms if it is inside the other
+    one. They turn as asked in the sense of least squares, in which deep middles count most. So arms move continuously,
+    and where no middle is inside, nothing moves. The exception is an arm that is half-way through the trunk, a thigh or
+    the other arm: there the nearest way out changes sides, and the arm leaps.
     """
 
     def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:
@@ -74,18 +79,25 @@ class Aside:
         self._share = self._tensor(share.T[:, :, None])
         """How much of a vertex moves with each arm, shape (2, V, 1)."""
         self._joints = [self._tensor(np.array(one, np.int64)) for one in ARMS]
-        self._other = self._tensor(np.flatnonzero(solids.of_vertex == 0))
-        self._faces = self._tensor(solids.faces[0].astype(np.int64))
-        """Faces of the body without its arms, closed, shape (F, 3)."""
-        self._box = memory(2, 1, 3, device=device)
-        self._corners = [as_warp(corner, wp.vec3) for corner in self._box]
+        self._faces = self._tensor(np.concatenate(solids.faces).astype(np.int64))
+        """Faces of the body without its arms and of each arm, all closed, shape (F, 3)."""
+        self._corners = [self._tensor(np.unique(one)) for one in solids.faces]
+        """The points of each of these solids."""
+        self._box = memory(2, len(solids.faces), 3, device=device)
+        """Their lowest and highest corners [m]."""
         self._points = memory(len(rest) + len(means.start) - self._first_cap, 3, device=device)
         at_rest = body.v_template.to(self._points)
         self._points.copy_(torch.cat((at_rest, self._means(at_rest)[self._first_cap :])))
-        self._tree: Any = wp.Mesh(as_warp(self._points, wp.vec3), ints(solids.faces[0].ravel(), device))
-        self._find = Repeated(kernels.inside_kernel, (wp.vec3, wp.int32, wp.vec3), [self._tree.id, *self._corners])
+        points = as_warp(self._points, wp.vec3)
+        self._trees = [wp.Mesh(points, ints(one.ravel(), device)) for one in solids.faces]
+        trees = wp.array([one.id for one in self._trees], dtype=wp.uint64, device=str(device))
+        first_face = ints(np.cumsum([0, *map(len, solids.faces)]), device)
+        box = [as_warp(corner, wp.vec3) for corner in self._box]
+        self._find = Repeated(kernels.inside_kernel, (wp.int32, wp.vec3, wp.int32, wp.vec3), [trees, first_face, *box])
+        self._asked = torch.cat((torch.zeros_like(self._arm), len(ARMS) - self._arm)).int()
+        """The solids that middles are looked for in: the body, and then the other arm, shape (2 C,)."""
         if self._is_serial:
-            self._look = self._recorded_look(mesh, weights)
+            self._look = self._recorded_look(solids, weights, box)
 
     def __call__(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
         """One body's skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms moved aside.
@@ -95,23 +107,17 @@ class Aside:
         if self._is_serial and not self._is_any_inside(skin):
             return skin, rotation
         means = self._means(skin)
-        shoulder = means[: len(ARMS)][self._arm]
-        arm = means[len(ARMS) : self._first_cap] - shoulder
+        pivots, middles = means[: len(ARMS)], means[len(ARMS) : self._first_cap]
+        arm = middles - pivots[self._arm]
         points = torch.cat((skin, means[self._first_cap :]))
-        if not self._is_serial:  # on a CPU the check above has fitted box and tree
-            self._box[:, 0] = torch.stack(skin.detach()[self._other].aminmax(dim=0))
+        if not self._is_serial:  # on a CPU the check above has fitted boxes and trees
             self._points.copy_(points.detach())
-            with torch_stream(self._device):
-                self._tree.refit()
-        turn, length2, is_of = skin.new_zeros(len(ARMS), 3), (arm * arm).sum(1), self._is_of.to(skin)
-        longest = torch.where(self._is_of, length2.sqrt(), 0.0).amax(1)
+            self._box.copy_(torch.stack([torch.stack(self._points[one].aminmax(dim=0)) for one in self._corners], 1))
+            refit(self._trees, self._device)
+        longest = torch.where(self._is_of, arm.norm(dim=1), 0.0).amax(1)
+        turn = skin.new_zeros(len(ARMS), 3)
         for _ in range(self._rounds):
-            at = (rotvec_to_rotmat(turn)[self._arm] @ arm[..., None])[..., 0]
-            out = self._way_out(points, shoulder + at)
-            squared = (out * out).sum(1, keepdim=True)
-            asked = squared * torch.linalg.cross(at, out) / length2[:, None]
-            total = is_of @ squared
-            turn = turn + is_of @ asked / torch.where(total > 0, total, 1.0)
+            turn = turn + self._step(points, pivots, arm, turn)
             turn = within(turn, torch.zeros_like(turn), self._farthest / longest)
         turns = rotvec_to_rotmat(turn)
         for pivot, by, share, joints in zip(means, turns, self._share.to(skin), self._joints, strict=False):
@@ -119,53 +125,96 @@ class Aside:
             rotation = rotation.index_copy(0, joints, by @ rotation[joints])
         return skin, rotation
 
+    def _step(self, points: Tensor, pivots: Tensor, arm: Tensor, turn: Tensor) -> Tensor:
+        """How much farther each arm has to turn [rad], shape (2, 3): a damped Gauss-Newton step.
+
+        A middle at the lever r from its shoulder that is inside by d asks for turn · (r × n) = d, n being the way out.
+        Two arms that are inside each other share d in proportion to their squared levers. Equations count by d².
+
+        Args:
+            points: The skin and the caps before any arm turned [m].
+            pivots: The shoulders [m], shape (2, 3).
+            arm: The middles before, from their shoulders [m], shape (C, 3).
+            turn: How far each arm has turned [rad], shape (2, 3).
+        """
+        turns, of = rotvec_to_rotmat(turn), self._arm
+        other, by_other = pivots.flip(0)[of], turns.flip(0)[of]
+        at = (turns[of] @ arm[..., None])[..., 0]
+        from_other = pivots[of] + at - other
+        # The other arm's tree hasn't turned, so the middle is turned back with it.
+        seen = other + (from_other[:, None] @ by_other)[:, 0]
+        of_body, of_arm = self._way_out(points, torch.cat((pivots[of] + at, seen))).view(2, -1, 3)
+        of_arm = (by_other @ of_arm[..., None])[..., 0]
+        # Three equations of each middle: its arm and the body; its arm and the other one; that one and its arm.
+        lever, way = torch.stack((at, at, from_other)), torch.stack((of_body, of_arm, -of_arm))
+        is_of = self._is_of.to(arm)
+        whose = torch.stack((is_of, is_of, is_of.flip(0)), 1)
+        lever2, depth2 = (lever * lever).sum(2), (way * way).sum(2)
+        share = torch.cat((torch.ones_like(lever2[:1]), lever2[1:] / lever2[1:].sum(0)))
+        row = torch.linalg.cross(lever, way)  # d (r × n)
+        damping = _DAMPING * torch.einsum("akc,kc->a", whose, lever2 * depth2)
+        scale = torch.where(damping > 0, damping, 1.0)[:, None]
+        matrix = torch.einsum("akc,kci,kcj->aij", whose, row, row) / scale[..., None]
+        asked = torch.einsum("akc,kc,kci->ai", whose, share * depth2, row) / scale
+        return solved(matrix + torch.eye(3).to(matrix), asked)
+
     def _means(self, skin: Tensor) -> Tensor:
         return embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=self._weight.to(skin))
 
-    def _recorded_look(self, mesh: Connectivity, weights: Array) -> Any:
-        """A launch that finds box, caps and middles (`_places`), and counts middles near the body (`_n_near`)."""
-        body = [joints for joints, _ in SOFTNESS if not any(set(joints) & set(arm) for arm in ARMS)]
-        part_of = part_of_faces(torch.from_numpy(weights), torch.from_numpy(mesh.faces).long(), [*body, *ARMS]).numpy()
-        corners = [np.unique(mesh.faces[part_of == k]) for k in range(len(body)) if (part_of == k).any()]
+    def _recorded_look(self, solids: Solids, weights: Array, box: list[Any]) -> Any:
+        """A launch that finds boxes, caps and middles (`_places`), and counts middles near each solid (`_n_near`)."""
+        corners, solid = [], []
+        for s, faces in enumerate(solids.faces):
+            own = faces[(faces < len(weights)).all(1)]
+            parts = [joints for joints, _ in SOFTNESS]
+            part_of = part_of_faces(torch.from_numpy(weights), torch.from_numpy(own).long(), parts).numpy()
+            for k in np.unique(part_of):
+                corners.append(np.unique(own[part_of == k]))
+                solid.append(s)
         means, n_middles = Means(), len(self._arm)
         start = np.append(self._start.numpy(), len(self._vertex))[len(ARMS) :]  # of all but the shoulders
         means.start, means.vertex = ints(start, "cpu"), ints(self._vertex, "cpu")
-        segments = ints(np.cumsum([0, *map(len, corners)]), "cpu"), ints(np.concatenate(corners), "cpu")
+        segments = (np.cumsum([0, *map(len, corners)]), np.concatenate(corners), solid)
         means.weight = wp.array(self._weight.numpy(), dtype=wp.float32, device="cpu")
-        places, self._n_near = memory(len(start) - 1, 3), memory(1, dtype=torch.int32)
-        self._places = places[:n_middles]
+        places, near = memory(len(start) - 1, 3), memory(len(self._trees), dtype=torch.int32)
+        self._places, self._n_near = places[:n_middles], near
         means.mean = as_warp(places, wp.vec3)
-        arguments = [as_warp(self._points, wp.vec3), mesh.n_vertices, n_middles, means, *segments]
-        arguments += [*self._corners, as_warp(self._n_near, wp.int32)]
+        arguments = [as_warp(self._points, wp.vec3), len(weights), ints(self._arm, "cpu"), means]
+        arguments += [*(ints(one, "cpu") for one in segments), *box, as_warp(self._n_near, wp.int32)]
         return Recorded(kernels.near_kernel, 1, arguments, "cpu")
 
     def _is_any_inside(self, skin: Tensor) -> bool:
-        """Whether any middle is inside the body. The tree is asked only if one is near the box of a segment.
+        """Whether any middle is inside the body or the other arm. A tree is asked only if one is near its solid.
 
-        Only for a CPU. Where this is true, box and tree have been fitted to `skin`.
+        Only for a CPU. Where this is true, boxes and trees have been fitted to `skin`.
         """
         self._points[: len(skin)].copy_(skin.detach())
         self._look.launch()
-        if not self._n_near:
+        of_body, *of_arms = self._n_near.tolist()
+        if not of_body and not any(of_arms):
             return False
-        self._tree.refit()
-        return bool((self._inside(self._places)[0] >= 0).any())
+        n_trees, n_sides = (len(self._trees), 2) if any(of_arms) else (1, 1)
+        refit(self._trees[:n_trees], self._device)
+        if not (self._inside(self._places.repeat(n_sides, 1))[0] >= 0).any():
+            return False
+        refit(self._trees[n_trees:], self._device)
+        return True
 
     def _inside(self, at: Tensor) -> tuple[Tensor, Tensor]:
-        """The body's closest face to each place (C, 3) [m], -1 for one outside, and the weights of its corners."""
+        """The solids' closest faces to the middles at (C, 3) or (2 C, 3) [m], -1 outside, and corners' weights."""
         at = at.detach().float().contiguous()
         face, weights = torch.empty(len(at), dtype=torch.int32, device=self._device), torch.zeros_like(at)
-        self._find((len(at),), at, face, weights)
+        self._find((len(at),), self._asked[: len(at)], at, face, weights)
         return face, weights
 
     def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
-        """The way out from each of the middles at (C, 3) [m] that is inside; zeros for the others."""
+        """The way out of the body and of the other arm (2 C, 3) [m], from the middles; zeros for those outside."""
         face, known = self._inside(at)
         corners = points[self._faces[face.clamp_min(0).long()]]
         weights = known if is_plain(points) else weights_at(at, corners, known.to(at))
         out = (weights[..., None] * corners).sum(1) - at
         depth = (out * out).sum(1, keepdim=True).clamp_min(_TINY).sqrt()
-        out = out + (self._thumb / depth).clamp(max=1.0) * out
+        out = out + (self._thumb.repeat(2, 1) / depth).clamp(max=1.0) * out
         return torch.where((face >= 0)[:, None], out, torch.zeros_like(out))
 
     def _tensor(self, values: NDArray[Any]) -> Tensor:

@@ -38,8 +38,14 @@ POSES = {
 INSIDE = {
     "hand in the hip": {"left_shoulder": (0, 0, -1.54), "right_shoulder": (0, 0, 1.53)},
     "hand in a thigh that is lifted": {"left_shoulder": (0, 0, -1.5), "left_hip": (0, 0, 0.23)},
+    "forearms in each other": {
+        "left_shoulder": (0, -1.59, -0.15),
+        "right_shoulder": (0, 1.61, 0.14),
+        "left_elbow": (0, -1.22, 0),
+        "right_elbow": (0, 0.79, 0),
+    },
 }
-"""Poses in which an arm is inside the body: it goes aside as a whole."""
+"""Poses in which an arm is inside the body or the other arm: it goes aside as a whole."""
 ALL = POSES | INSIDE
 
 
@@ -199,7 +205,7 @@ def test_copies_of_an_outfit_keep_the_settings_of_its_collider(body: SmplBody) -
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Collider) -> None:
-    """As a whole, hands unbent, by what it takes; nothing else moves."""
+    """As a whole, hands unbent, by what it takes; nothing else moves. Two arms in each other both do."""
     skin = body(pose=posed(body, INSIDE[name]))
     aside, rotation = collider.aside(skin.vertices, skin.transforms.rotation)
     deep = collider.anatomy.aside._way_out(*_asked(collider, skin.vertices[0])).norm(dim=1)
@@ -210,6 +216,8 @@ def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Coll
     assert 10 * MM < way.max() < 60 * MM
     is_arm = body.weights[:, [joint for arm in ARMS for joint in arm]].sum(1) > 0
     assert way[~is_arm].max() == 0
+    if name == "forearms in each other":
+        assert all(way[body.weights[:, list(arm)].sum(1) > 0.5].max() > 5 * MM for arm in ARMS)
     edges = collider.anatomy.edges[is_arm[collider.anatomy.edges].all(1)]
     before, after = ((one[0, edges[:, 0]] - one[0, edges[:, 1]]).norm(dim=1) for one in (skin.vertices, aside))
     hand = body.weights[:, [20, 21, 22, 23]].sum(1) > 0.999
@@ -219,19 +227,53 @@ def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Coll
     assert collider.shift(skin.vertices, aside, aside)[0, 3] == 0
 
 
+_HUG = (0, -1.47, 0.29), (0, 1.62, 0.42), (0, -2.0, 0), (0, 1.1, 0)
+
+
+def test_arms_turn_by_damped_least_squares(body: SmplBody, collider: Collider) -> None:
+    """Against the definition, middle by middle: of arms in each other and in the chest."""
+    turns = dict(zip(INSIDE["forearms in each other"], _HUG, strict=True))
+    points, middles = _asked(collider, body(pose=posed(body, turns)).vertices[0])
+    aside, n = collider.anatomy.aside, len(middles) // 2
+    pivots = aside._means(points[: len(body.v_template)])[: len(ARMS)]
+    step = aside._step(points, pivots, middles[:n] - pivots[aside._arm], torch.zeros(2, 3))
+
+    ways = aside._way_out(points, middles).double().numpy()
+    assert ways[:n].any()
+    assert ways[n:].any()
+    place, pivot, arm_of = middles.double().numpy(), pivots.double().numpy(), aside._arm.tolist()
+    matrix, right, squares = np.zeros((2, 3, 3)), np.zeros((2, 3)), np.zeros(2)
+    for row, way in enumerate(ways):
+        depth = np.linalg.norm(way)
+        if not depth:
+            continue
+        own, is_of_arm = arm_of[row % n], row >= n
+        lever = [place[row] - pivot[arm] for arm in (own, 1 - own)]
+        square = [one @ one for one in lever]
+        asked = [square[k] / sum(square) if is_of_arm else 1.0 for k in range(2)]
+        for k, arm in enumerate((own, 1 - own) if is_of_arm else (own,)):
+            along = np.cross(lever[k], way / depth) * (-1) ** k
+            matrix[arm] += depth**2 * np.outer(along, along)
+            right[arm] += depth**2 * asked[k] * depth * along
+            squares[arm] += depth**2 * square[k]
+    wanted = [np.linalg.solve(matrix[arm] + 0.25 * squares[arm] * np.eye(3), right[arm]) for arm in range(2)]
+    np.testing.assert_allclose(step.numpy(), np.array(wanted), atol=1e-5, rtol=1e-3)
+
+
 def test_a_thumb_goes_out_as_far_as_it_was_inside(body: SmplBody, collider: Collider) -> None:
     """Cloth can't follow a dent as narrow as a thumb. Nothing is asked where no middle is inside: it is continuous."""
     skin = body(pose=posed(body, INSIDE["hand in the hip"])).vertices[0]
     aside = collider.anatomy.aside
     points, middles = _asked(collider, skin)
-    way, thumb = aside._way_out(points, middles), aside._thumb[:, 0].clone()
-    assert 2 <= torch.count_nonzero(thumb) <= 8
-    assert thumb.max() < 0.02
+    way, radius = aside._way_out(points, middles), aside._thumb.clone()
+    thumb = radius[:, 0].repeat(2)
+    assert 2 <= torch.count_nonzero(radius) <= 8
+    assert radius.max() < 0.02
     aside._thumb.zero_()
     try:
         depth = aside._way_out(points, middles).norm(dim=1)
     finally:
-        aside._thumb.copy_(thumb[:, None])
+        aside._thumb.copy_(radius)
     torch.testing.assert_close(way.norm(dim=1), depth + torch.minimum(depth, thumb), atol=1e-6, rtol=1e-5)
     assert (depth[thumb > 0] > 0).any()
 
@@ -261,10 +303,10 @@ def _middles(aside: Aside, skin: torch.Tensor) -> torch.Tensor:
 
 
 def _asked(collider: Collider, skin: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Skin (V, 3) [m] with the middles of its caps, which the tree is of from now on, and what may be inside of it."""
+    """Skin (V, 3) [m] with the middles of its caps, which the trees are of from now on, and what may be inside them."""
     aside = collider.anatomy.aside
     aside(skin, torch.eye(3).expand(24, 3, 3))
-    return torch.cat((skin, aside._means(skin)[aside._first_cap :])), _middles(aside, skin)
+    return torch.cat((skin, aside._means(skin)[aside._first_cap :])), _middles(aside, skin).repeat(2, 1)
 
 
 def test_a_seam_parts_the_means_of_the_skin_on_its_two_sides(body: SmplBody) -> None:
