@@ -211,7 +211,9 @@ class BagWriter:
         try:
             stream = self._working.open("wb" if overwrite else "xb")
         except FileExistsError as error:
-            raise BagError(f"{self.path}: exists already; choose another path, or --overwrite it") from error
+            raise BagError(
+                f"{self.path}: exists already; choose another path, or --overwrite it (overwrite=True in Python)"
+            ) from error
         if is_new:
             self._made.append(self._working)
         return stream
@@ -225,7 +227,7 @@ class BagWriter:
         others = [file.name for file in found if file.name.removesuffix(_PARTIAL) not in own]
         if found and (others or not overwrite):
             foreign = f"it holds other files than a bag's: {others[0]}" if overwrite else ""
-            hint = foreign or "choose another path, or --overwrite it"
+            hint = foreign or "choose another path, or --overwrite it (overwrite=True in Python)"
             raise BagError(f"{directory}: the directory isn't empty; {hint}")
         return [file for file in found if not file.name.endswith(_PARTIAL)]
 
