@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -35,16 +36,32 @@ PLAUSIBLE_ANGLE = 1e3
 PLAUSIBLE_COEFFICIENT = 20.0  # standard deviations
 PLAUSIBLE_TRANSL = 1e9
 """[m]"""
+_ABOUT_POSES = {
+    63: "the 21 joints of a body without its root: put the root's rotation first, and 6 zeros last",
+    66: "the 22 joints of a body without hands: append 6 zeros",
+    69: "23 joints without the root: put its rotation first",
+    156: "SMPL-H: take the first 66, and append 6 zeros",
+    165: "SMPL-X: take the first 66, and append 6 zeros",
+    96: "as quaternions? scipy's Rotation.from_quat(q) takes xyzw, then .as_rotvec()",
+    144: "as 6D rotations? make them matrices, then scipy's Rotation.from_matrix(R).as_rotvec()",
+    216: "as matrices? scipy's Rotation.from_matrix(R).as_rotvec()",
+}
+"""What arrays of so many numbers are, and what to do with them."""
 SET_BACK_NS = 10**9
 """A stamp this much older than the one before tells that time was set back; one less old only comes late [ns]."""
 
 
 def checked_numbers(
-    name: str, value: Any, shape: tuple[int, ...], dtype: type[np.floating[Any]], limit: float = np.inf
+    name: str,
+    value: Any,
+    shape: tuple[int, ...],
+    dtype: type[np.floating[Any]],
+    limit: float = np.inf,
+    advice: Mapping[int, str] = MappingProxyType({}),
 ) -> NDArray[Any]:
     """`value` as a read-only array of this shape; it may have it already, or be flat. No number exceeds `limit`.
 
-    Raises `FrameError` for anything else, naming it `name`.
+    Raises `FrameError` for anything else, naming it `name`, with `advice` for an array of so many numbers.
     """
     try:
         array = as_numbers(value).astype(np.float64)
@@ -54,7 +71,9 @@ def checked_numbers(
     if array.size != size or array.shape not in (shape, (size,)):
         wanted = dict.fromkeys((shape, (size,)))
         msg = f"{name} must have the shape {' or '.join(map(str, wanted))}, got {array.shape}"
-        msg += f": take the first {shape[0]}" if len(shape) == array.ndim == 1 and array.size > shape[0] else ""
+        hint = f"take the first {shape[0]}" if len(shape) == array.ndim == 1 and array.size > shape[0] else ""
+        hint = advice.get(array.size, hint)
+        msg += f": {hint}" if hint else ""
         raise FrameError(msg)
     largest = float(np.abs(array).max())  # NaN or infinite if any value is
     if not math.isfinite(largest):
@@ -126,7 +145,7 @@ class SmplFrame:
         Raises `FrameError` when an array has a wrong number of elements, isn't finite, or is out of range.
         """
         vars(self).update(  # a frozen dataclass is filled once, here
-            pose=checked_numbers("pose", pose, (N_JOINTS, 3), np.float32, MAX_ANGLE),
+            pose=checked_numbers("pose", pose, (N_JOINTS, 3), np.float32, MAX_ANGLE, _ABOUT_POSES),
             betas=checked_numbers("betas", betas, (N_BETAS,), np.float32, MAX_COEFFICIENT),
             transl=checked_numbers("transl", transl, (3,), np.float64),
             style=None if style is None else checked_numbers("style", style, (N_STYLES,), np.float32, MAX_COEFFICIENT),
