@@ -72,8 +72,8 @@ def dress(
     if up is not None:
         require_batch("up", up, (3,), dtype=dtype, sizes=(len(pose),))
     with without_autocast(pose.device.type):
-        turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
-        posed = wearer.outfit.body.posed(at_root, wearer.shape)
+        posed = wearer.outfit.body.posed(pose, wearer.shape, in_root=True)
+        turns = RootTurn.taken_off(posed)
         lap("body", None)
         outfit, body, aside = wearer.outfit, posed.vertices, posed.vertices
         if outfit.collider is not None:
