@@ -23,12 +23,13 @@ def require_batch(
 
     Kernels read what they are given without a check of their own.
     """
+    shape = value.shape if isinstance(value, Tensor) else ()
+    if shape and shape[1:] == row and dtype in (None, value.dtype) and (not sizes or shape[0] in sizes):
+        return
     require_type(value, Tensor, f"{name} as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
-    is_typed = value.dtype == dtype or dtype is None
-    if value.shape[1:] != row or not value.ndim or not is_typed or (sizes and len(value) not in sizes):
-        kind, batch = dtype or "a tensor", " or ".join(map(str, dict.fromkeys(sizes))) or "B"
-        msg = f"{name} must be {kind} of the shape ({', '.join(map(str, (batch, *row)))}), "
-        raise FrameError(f"{msg}got {value.dtype} of the shape {tuple(value.shape)}")
+    kind, batch = dtype or "a tensor", " or ".join(map(str, dict.fromkeys(sizes))) or "B"
+    msg = f"{name} must be {kind} of the shape ({', '.join(map(str, (batch, *row)))}), "
+    raise FrameError(f"{msg}got {value.dtype} of the shape {tuple(shape)}")
 
 
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
