@@ -120,25 +120,26 @@ class StackedPerceptrons(_Standardised):
 
     def forward(self, x: Tensor, mixture: Tensor) -> Tensor:
         """Σ_k mixture[:, k] · perceptron_k(x), shape (B, O), of x (B, I) and mixture (B, K)."""
-        weights, biases, mixture = self._counting(mixture)
+        (*weights, last), (*biases, last_bias), mixture = self._counting(mixture)
         h = self.seen(x).expand(mixture.shape[1], -1, -1)  # (K, B, I)
-        for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-            h = self.activation(torch.baddbmm(bias[:, None], h, weight))
+        for weight, bias in zip(weights, biases, strict=True):
+            h = self.activation(torch.baddbmm(bias, h, weight))
             h = functional.dropout(h, self.dropout) if self.training else h
         # Mixing before the last layer turns it into one product, without a (K, B, O) array, large with dense heads.
         mixed = (h * mixture.T[..., None]).transpose(0, 1).flatten(1)  # (B, K * H)
-        return torch.addmm(mixture @ biases[-1], mixed, weights[-1].flatten(0, 1))
+        return torch.addmm(last_bias, mixed, last.flatten(0, 1))
 
     def _counting(self, mixture: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """Weights and biases of the perceptrons that count in a mixture (B, K), and their part of it.
 
+        Of the last layer, which is linear, the biases are mixed already, (B, O).
         They are remembered, since a mixture stays with its wearer. A GPU, which would have to be waited for, and
         whatever needs derivatives, get all.
         """
         tensors = [*self.weights, *self.biases]
         is_serial = self._is_serial and not mixture.is_cuda
         if self.training or not is_serial or not is_plain(mixture, *tensors):
-            return list(self.weights), list(self.biases), mixture
+            return _mixed(list(self.weights), list(self.biases), mixture)
         is_counted = not any(one.is_inference() for one in (mixture, *tensors))  # else nothing says when they change
         version = [one._version for one in (mixture, *tensors)] if is_counted else None
         known = self._known.get(id(mixture))
@@ -147,8 +148,13 @@ class StackedPerceptrons(_Standardised):
             weights, biases = ([one.detach()[rows] for one in some] for some in (self.weights, self.biases))
             if len(self._known) >= _MOST_MIXTURES:
                 self._known.clear()
-            known = self._known[id(mixture)] = version, mixture, (weights, biases, mixture[:, rows])
+            known = self._known[id(mixture)] = version, mixture, _mixed(weights, biases, mixture[:, rows])
         return known[2]
+
+
+def _mixed(weights: list[Tensor], biases: list[Tensor], mixture: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    *inner, last = biases
+    return weights, [*(bias[:, None] for bias in inner), mixture @ last], mixture
 
 
 _LEAST = 1e-4

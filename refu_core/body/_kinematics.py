@@ -23,12 +23,13 @@ def require_batch(
 
     Kernels read what they are given without a check of their own.
     """
+    shape = value.shape if isinstance(value, Tensor) else ()
+    if shape and shape[1:] == row and dtype in (None, value.dtype) and (not sizes or shape[0] in sizes):
+        return
     require_type(value, Tensor, f"{name} as a torch.Tensor, such as torch.as_tensor(array) gives", error=FrameError)
-    is_typed = value.dtype == dtype or dtype is None
-    if value.shape[1:] != row or not value.ndim or not is_typed or (sizes and len(value) not in sizes):
-        kind, batch = dtype or "a tensor", " or ".join(map(str, dict.fromkeys(sizes))) or "B"
-        msg = f"{name} must be {kind} of the shape ({', '.join(map(str, (batch, *row)))}), "
-        raise FrameError(f"{msg}got {value.dtype} of the shape {tuple(value.shape)}")
+    kind, batch = dtype or "a tensor", " or ".join(map(str, dict.fromkeys(sizes))) or "B"
+    msg = f"{name} must be {kind} of the shape ({', '.join(map(str, (batch, *row)))}), "
+    raise FrameError(f"{msg}got {value.dtype} of the shape {tuple(shape)}")
 
 
 def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
@@ -81,30 +82,36 @@ class RigidTransforms(NamedTuple):
     """[m], shape (B, 24, 3)."""
 
 
-def forward_kinematics(rotations: Tensor, joints: Tensor) -> tuple[Tensor, RigidTransforms]:
-    """Posed joints [m], shape (B, 24, 3), and the transforms that move rest-pose points with each joint's bone.
+def forward_kinematics(
+    pose: Tensor, joints: Tensor, *, in_root: bool = False
+) -> tuple[Tensor, Tensor, RigidTransforms]:
+    """Rotations, posed joints [m], (B, 24, 3), and the transforms that move rest-pose points with each joint's bone.
 
-    `rotations` (B, 24, 3, 3) are relative to the parent joints; `joints` are those at rest [m], shape (B, 24, 3), or
-    (1, 24, 3) for bodies of one shape. Raises `FrameError` for a wrong shape.
+    `pose` are rotation vectors [rad], shape (B, 24, 3), and the rotations (B, 24, 3, 3) are the same, relative to the
+    parent joints. `joints` are those at rest [m], shape (B, 24, 3), or (1, 24, 3) for bodies of one shape. With
+    `in_root` joints and transforms are in the root's axes: all is posed but the root. Raises `FrameError` for a wrong
+    shape.
     """
-    n, batch = len(PARENTS), len(rotations)
-    if rotations.shape != (batch, n, 3, 3) or joints.shape not in ((batch, n, 3), (1, n, 3)):
-        msg = f"wanted rotations (B, {n}, 3, 3) of joints (B, {n}, 3) or (1, {n}, 3), "
-        msg += f"got {tuple(rotations.shape)} and {tuple(joints.shape)}"
+    n, batch = len(PARENTS), len(pose)
+    if pose.shape != (batch, n, 3) or joints.shape not in ((batch, n, 3), (1, n, 3)):
+        msg = f"wanted rotations (B, {n}, 3) of joints (B, {n}, 3) or (1, {n}, 3), "
+        msg += f"got {tuple(pose.shape)} and {tuple(joints.shape)}"
         raise FrameError(msg)
-    if is_plain(rotations, joints):
-        turned = torch.empty_like(rotations, memory_format=torch.contiguous_format)
-        translation, posed = rotations.new_empty(2, batch, n, 3)
-        inputs = rotations.contiguous(), joints.contiguous(), _parents(rotations.device)
-        _chain((batch,), *inputs, turned, translation, posed)
-        return posed, RigidTransforms(turned, translation)
-    turns, places = [rotations[:, 0]], [joints[:, 0].expand(batch, 3)]
+    if is_plain(pose, joints):
+        rotations, turned = pose.new_empty(2, batch, n, 3, 3).unbind()
+        translation, posed = pose.new_empty(2, batch, n, 3).unbind()
+        inputs = pose.contiguous(), joints.contiguous(), _parents(pose.device)
+        _chain[in_root]((batch,), *inputs, rotations, turned, translation, posed)
+        return rotations, posed, RigidTransforms(turned, translation)
+    rotations = rotvec_to_rotmat(pose)
+    root = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(batch, 3, 3) if in_root else rotations[:, 0]
+    turns, places = [root], [joints[:, 0].expand(batch, 3)]
     for joint, parent in enumerate(PARENTS[1:], start=1):
         bone = joints[:, joint] - joints[:, parent]
         turns.append(turns[parent] @ rotations[:, joint])
         places.append(places[parent] + (turns[parent] @ bone[..., None])[..., 0])
     turned, posed = torch.stack(turns, 1), torch.stack(places, 1)
-    return posed, RigidTransforms(turned, posed - (turned @ joints.unsqueeze(-1)).squeeze(-1))
+    return rotations, posed, RigidTransforms(turned, posed - (turned @ joints.unsqueeze(-1)).squeeze(-1))
 
 
 @cache
@@ -114,4 +121,5 @@ def _parents(device: torch.device) -> Tensor:
 
 
 _rotate = Repeated(rotation_kernel, (wp.vec3, wp.mat33))
-_chain = Repeated(chain_kernel, (wp.mat33, wp.vec3, wp.int32, wp.mat33, wp.vec3, wp.vec3))
+_CHAIN = wp.vec3, wp.vec3, wp.int32, wp.mat33, wp.mat33, wp.vec3, wp.vec3
+_chain = {in_root: Repeated(chain_kernel, _CHAIN, [in_root]) for in_root in (False, True)}

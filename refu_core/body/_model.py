@@ -17,7 +17,7 @@ from torch import Tensor
 from refu_core._device import checked_device, without_autocast
 from refu_core._numbers import NOT_NUMBERS, as_numbers
 from refu_core.body._fingers import without_fingers
-from refu_core.body._kinematics import RigidTransforms, forward_kinematics, require_batch, rotvec_to_rotmat
+from refu_core.body._kinematics import RigidTransforms, forward_kinematics, require_batch
 from refu_core.body._skinning import Skinning
 from refu_core.errors import BodyError, FrameError
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -39,6 +39,8 @@ class BodyOutput(NamedTuple):
     """[m], shape (B, 24, 3)."""
     transforms: RigidTransforms
     """Rest pose to posed, per joint and without `transl`; what garments are posed with."""
+    rotations: Tensor
+    """Of the joints relative to their parents, shape (B, 24, 3, 3)."""
 
 
 class Shape(NamedTuple):
@@ -290,19 +292,18 @@ class SmplBody:
         """The unposed bodies of betas (B, 10), as `posed` takes them."""
         return Shape(self.rest_vertices(betas), self.rest_joints(betas))
 
-    def posed(self, pose: Tensor, shape: Shape) -> BodyOutput:
+    def posed(self, pose: Tensor, shape: Shape, *, in_root: bool = False) -> BodyOutput:
         """Poses bodies by rotation vectors (B, 24, 3) [rad]; `shape` has as many bodies, or one for all.
 
-        Raises `FrameError` for anything but such a tensor.
+        With `in_root` all but the rotations are in the root's axes. Raises `FrameError` for anything but such a tensor.
         """
         require_batch("the pose's rotation vectors", pose, (N_JOINTS, 3))
-        rotations = rotvec_to_rotmat(pose)
-        joints, transforms = forward_kinematics(rotations, shape.joints)
+        rotations, joints, transforms = forward_kinematics(pose, shape.joints, in_root=in_root)
         vertices = shape.vertices
         if self._posedirs is not None:
             feature = (rotations[:, 1:] - torch.eye(3, dtype=self.dtype, device=self.device)).flatten(1)
             vertices = vertices + (feature @ self._posedirs.T).view(len(pose), vertices.shape[1], 3)
-        return BodyOutput(self._skinning(vertices, transforms), joints, transforms)
+        return BodyOutput(self._skinning(vertices, transforms), joints, transforms, rotations)
 
 
 def _tensor(name: str, value: ArrayLike | Tensor, device: torch.device) -> Tensor:

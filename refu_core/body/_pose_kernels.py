@@ -1,7 +1,5 @@
 """Kernels that pose a body when no derivative is needed: a few launches replace two hundred small tensor operations."""
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from refu_core import _warp  # noqa: F401  (quiets Warp before it starts)
@@ -47,10 +45,12 @@ def rotation_kernel(rotvec: wp.array[wp.vec3], rotation: wp.array[wp.mat33]) -> 
 
 @wp.kernel
 def chain_kernel(
-    local: wp.array2d[wp.mat33],
+    in_root: wp.bool,
+    pose: wp.array2d[wp.vec3],
     joints: wp.array2d[wp.vec3],
     parents: wp.array[int],
     # outputs
+    local: wp.array2d[wp.mat33],
     rotation: wp.array2d[wp.mat33],
     translation: wp.array2d[wp.vec3],
     posed: wp.array2d[wp.vec3],
@@ -61,11 +61,14 @@ def chain_kernel(
     for j in range(parents.shape[0]):
         parent = parents[j]
         here = joints[shape, j]
-        turn = local[b, j]
+        turn = rodrigues(pose[b, j])
+        local[b, j] = turn
         place = here
         if parent >= 0:
             turn = rotation[b, parent] @ turn
             place = posed[b, parent] + rotation[b, parent] @ (here - joints[shape, parent])
+        elif in_root:
+            turn = wp.identity(n=3, dtype=float)
         rotation[b, j] = turn
         posed[b, j] = place
         translation[b, j] = place - turn @ here
@@ -87,20 +90,14 @@ def turned(
     return way
 
 
-if TYPE_CHECKING:
-    Transform = wp.Vector[float]
-else:
-    Transform = wp.types.vector(length=12, dtype=wp.float32)
-"""A joint's rotation, row by row, and its translation."""
-
-
 @wp.kernel
 def skin_kernel(
     points: wp.array2d[wp.vec3],
     start: wp.array[int],
     joint: wp.array[int],
     weight: wp.array[float],
-    transforms: wp.array2d[Transform],
+    rotation: wp.array2d[wp.mat33],
+    translation: wp.array2d[wp.vec3],
     each: wp.array[int],
     # output
     posed: wp.array2d[wp.vec3],
@@ -112,15 +109,12 @@ def skin_kernel(
     b, strip = wp.tid()
     shape = wp.min(b, points.shape[0] - 1)
     for v in range(strip * each[0], wp.min((strip + 1) * each[0], posed.shape[1])):
-        t = Transform()
+        turn = wp.mat33()
+        shift = wp.vec3()
         k = int(start[v])
         last = start[v + 1]
         while k < last:  # takes half the instructions of Warp's range
-            t += weight[k] * transforms[b, joint[k]]
+            turn += weight[k] * rotation[b, joint[k]]
+            shift += weight[k] * translation[b, joint[k]]
             k += 1
-        p = points[shape, v]
-        posed[b, v] = wp.vec3(
-            t[0] * p[0] + t[1] * p[1] + t[2] * p[2] + t[9],
-            t[3] * p[0] + t[4] * p[1] + t[5] * p[2] + t[10],
-            t[6] * p[0] + t[7] * p[1] + t[8] * p[2] + t[11],
-        )
+        posed[b, v] = turn @ points[shape, v] + shift

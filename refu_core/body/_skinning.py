@@ -10,13 +10,13 @@ from torch import Tensor
 
 from refu_core._warp import Repeated, is_plain, strips
 from refu_core.body._kinematics import RigidTransforms
-from refu_core.body._pose_kernels import Transform, skin_kernel
+from refu_core.body._pose_kernels import skin_kernel
 from refu_core.errors import MeshError
 
 _MIN_DETERMINANT = 1e-4
 """Blends of rotations almost half a turn apart collapse; below this determinant unposing is bounded, not exact."""
 
-_skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, Transform, wp.int32, wp.vec3))
+_skin = Repeated(skin_kernel, (wp.vec3, wp.int32, wp.int32, wp.float32, wp.mat33, wp.vec3, wp.int32, wp.vec3))
 
 
 def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTransforms:
@@ -24,13 +24,8 @@ def blend_transforms(weights: Tensor, transforms: RigidTransforms) -> RigidTrans
 
     The result's leading shape is (B, V); the "rotation" of a blend isn't orthonormal.
     """
-    blended = weights @ _stacked(transforms)
+    blended = weights @ torch.cat((transforms.rotation.flatten(2), transforms.translation), -1)
     return RigidTransforms(blended[..., :9].view(*blended.shape[:2], 3, 3), blended[..., 9:])
-
-
-def _stacked(transforms: RigidTransforms) -> Tensor:
-    """Rotations and translations side by side, shape (B, 24, 12)."""
-    return torch.cat((transforms.rotation.flatten(2), transforms.translation), -1)
 
 
 class JointWeights(NamedTuple):
@@ -70,10 +65,10 @@ class Skinning:
             raise MeshError(f"wanted points of the shape ({batch}, {n}, 3) or (1, {n}, 3), got {tuple(points.shape)}")
         if not is_plain(points, rotation, translation, self._weights):
             return apply_transforms(points, blend_transforms(self._weights, transforms))
-        points, stacked = points.contiguous(), _stacked(transforms)
         posed = points.new_empty(batch, n, 3)
         n_strips, each = strips(n, posed.device)
-        _skin((batch, n_strips), points, *self._by_joint, stacked, each, posed)
+        moves = rotation.contiguous(), translation.contiguous()
+        _skin((batch, n_strips), points.contiguous(), *self._by_joint, *moves, each, posed)
         return posed
 
 

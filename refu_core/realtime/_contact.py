@@ -42,8 +42,8 @@ class Worn(NamedTuple):
     """The same before collision handling [m], shape (V, 3)."""
     numbers: Tensor
     """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_layered` of a `GarmentStats`, float32, shape (5,)."""
-    n_clipped: Tensor
-    """How many vertices are so far off that their distance wasn't computed, shape ()."""
+    n_clipped: int | Tensor
+    """How many vertices are so far off that their distance wasn't computed."""
 
 
 N_NUMBERS = 5
@@ -175,7 +175,7 @@ class ContactStage:
 
         With `goes_on` it continues from the last call for the same garments.
         """
-        n_layered = torch.zeros(1, dtype=torch.int32, device=vertices.device)
+        n_layered = vertices.new_zeros(1)
         for inner, garment in worn.items():
             vertices, n_low = self._layers[name][inner](vertices, garment.vertices, goes_on=goes_on)
             n_layered = n_layered + n_low
@@ -205,7 +205,7 @@ class ContactStage:
         if vertices is not given:
             laid = laid + (vertices - given)
         assert start.face is not None  # these distances are to faces
-        n_clipped = torch.count_nonzero(start.face < 0)
+        n_clipped = 0 if isinstance(self.sdf, ApproxSdf) else torch.count_nonzero(start.face < 0)
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
         numbers, kept = done.numbers, margin

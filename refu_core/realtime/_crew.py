@@ -67,6 +67,8 @@ class Crew:
 
     def share(self, step: FrameStep, work: Work, frames: Sequence[SmplFrame]) -> list[PipelineOutput]:
         """Does `work` on frames, which are shared out among `step` and all steps that are free."""
+        if len(frames) == 1:
+            return work(step, frames)
         n_free = self._free.qsize() if os.getpid() == self._process else 0
         own, *others = (frames[part] for part in shares(len(frames), min(len(frames), 1 + n_free)))
         started: list[Future[list[PipelineOutput] | None]] = []

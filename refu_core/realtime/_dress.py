@@ -72,13 +72,14 @@ def dress(
     if up is not None:
         require_batch("up", up, (3,), dtype=dtype, sizes=(len(pose),))
     with without_autocast(pose.device.type):
-        turns, at_root = RootTurn.taken_off(pose, wearer.shape.joints)
-        posed = wearer.outfit.body.posed(at_root, wearer.shape)
+        posed = wearer.outfit.body.posed(pose, wearer.shape, in_root=True)
+        turns = RootTurn.taken_off(posed)
         lap("body", None)
         outfit, body, aside = wearer.outfit, posed.vertices, posed.vertices
         if outfit.collider is not None:
             aside, rotation = outfit.collider.aside(posed.vertices, posed.transforms.rotation)
             body = outfit.collider.apart(aside, rotation)
+            gave_way = body - posed.vertices
             lap("collider", None)
         drapes, seen = {}, pose if up is None else upright(pose, up)
         for name, garment in wearer.garments.items():
@@ -92,7 +93,7 @@ def dress(
                 unposed, on_mean = unposed + displacement, on_mean + displacement
             vertices = wearable.template.pose(unposed, posed.transforms)
             if outfit.collider is not None:
-                vertices = vertices + outfit.below[name](body - posed.vertices)
+                vertices = vertices + outfit.below[name](gave_way)
             z = None if wearable.refu is None else wearable.refu.feature(garment.betas, seen, style)
             drapes[name] = Drape(vertices, unposed, on_mean, z)
             lap("backbone", name)

@@ -101,8 +101,9 @@ class FrameStep:
             shared.lap("adjust")
         margin_of = dict(zip(self.outfit.wearables, margins, strict=True))
         persons = []
-        shifts = dressed.body.new_zeros(len(pose), N_SHIFT)
-        if self.outfit.collider is not None:
+        if self.outfit.collider is None:
+            shifts = dressed.body.new_zeros(len(pose), N_SHIFT)
+        else:
             shifts = self.outfit.collider.shift(dressed.skin, dressed.aside, dressed.body)
         for person, (body, skin, turn) in enumerate(zip(dressed.body, dressed.skin, dressed.turns, strict=True)):
             clock = clocks[person] if clocks else StageClock()
@@ -114,7 +115,7 @@ class FrameStep:
             garments: dict[str, Worn] = {}
             if self.contact is None:
                 for name in self._order:
-                    garments[name] = Worn(raw[name], raw[name], body.new_zeros(N_NUMBERS), body.new_zeros(()))
+                    garments[name] = Worn(raw[name], raw[name], body.new_zeros(N_NUMBERS), 0)
             else:
                 laid = self.contact.laid(raw, dressed.transforms.rotation[person])
                 if len(self._order) > 1:
@@ -163,7 +164,7 @@ class FrameStep:
         for row in torch.from_numpy(packed):
             body, skin, shift, *parts = torch.split(row, self._sizes)
             garments = {
-                name: Worn(parts[3 * i].view(-1, 3), parts[3 * i + 1].view(-1, 3), parts[3 * i + 2], torch.zeros(()))
+                name: Worn(parts[3 * i].view(-1, 3), parts[3 * i + 1].view(-1, 3), parts[3 * i + 2], 0)
                 for i, name in enumerate(self.outfit.wearables)
             }
             yield Person(lambda points: points, body.view(-1, 3), skin.view(-1, 3), shift, garments)

@@ -268,7 +268,7 @@ class GarmentPipeline:
         with self._lock:
             found = [self._wearer(frame) for frame in frames]
             wearer = self._together(tuple(wearer for wearer, _ in found))
-        pose = torch.as_tensor(np.array([f.pose for f in frames]))
+        pose = torch.from_numpy(np.array([f.pose for f in frames]))
         margins = tuple(one.margin if margin is None else margin for one in self.outfit.wearables.values())
         told = {}
         if self.heeds_past and any(frame.past is not None for frame in frames):

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from refu_core.body import rotvec_to_rotmat
+from refu_core._warp import Repeated, is_plain, strips
+from refu_core.body import BodyOutput
+from refu_core.realtime._turn_kernels import turn_kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,27 +26,32 @@ class RootTurn:
 
     rotation: Tensor
     """Shape (3, 3)."""
-    shift: Tensor
-    """Keeps the root in its place [m], shape (3,)."""
+    root: Tensor
+    """It stays in its place [m], shape (3,)."""
 
     @staticmethod
-    def taken_off(pose: Tensor, joints: Tensor) -> tuple[list[RootTurn], Tensor]:
-        """The turns of persons, and their poses without them, (B, 24, 3) [rad].
+    def taken_off(posed: BodyOutput) -> list[RootTurn]:
+        """The turns of persons who were posed in their roots' axes (`SmplBody.posed`)."""
+        return [RootTurn(*turn) for turn in zip(posed.rotations[:, 0], posed.joints[:, 0], strict=True)]
 
-        Args:
-            pose: Rotation vectors [rad], shape (B, 24, 3).
-            joints: Joints in their rest poses [m], shape (B, 24, 3) or (1, 24, 3).
-        """
-        rotations, roots = rotvec_to_rotmat(pose[:, 0]), joints[:, 0]
-        shifts = roots - (rotations @ roots.unsqueeze(-1)).squeeze(-1)
-        at_root = torch.cat((torch.zeros_like(pose[:, :1]), pose[:, 1:]), 1)
-        return [RootTurn(*turn) for turn in zip(rotations, shifts, strict=True)], at_root
+    @property
+    def shift(self) -> Tensor:
+        """What is added to turned points, to keep the root in its place [m], shape (3,)."""
+        return self.root - self.rotation @ self.root
 
     def __call__(self, points: Tensor) -> Tensor:
         """Points [m], shape (N, 3), from the root's axes to the world's."""
-        return functional.linear(points, self.rotation, self.shift)
+        if points.shape[1:] != (3,) or not is_plain(points, self.rotation, self.root):
+            return functional.linear(points, self.rotation, self.shift)
+        n_strips, each = strips(len(points), points.device)
+        turned = torch.empty_like(points, memory_format=torch.contiguous_format)
+        _turn((n_strips,), self.rotation[None], self.root[None], points.contiguous(), each, turned)
+        return turned
 
     def to_host(self, points: Tensor) -> NDArray[np.float32]:
         """The same, as an array on the host."""
         seen: NDArray[np.float32] = self(points).cpu().numpy()
         return seen
+
+
+_turn = Repeated(turn_kernel, (wp.mat33, wp.vec3, wp.vec3, wp.int32, wp.vec3))

@@ -74,8 +74,8 @@ class ScaleNet(nn.Module):
         m, d = settings.feature_size, settings.latent_size
         if settings.kind != "distance":
             sizes = (N_INPUTS, settings.hidden_size, settings.hidden_size, m)
-            layers = (layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU()))
-            self.h = nn.Sequential(*layers)
+            # Numbered as in files of weights, where ReLU counts as a layer.
+            self.h = nn.ModuleDict({str(2 * i): nn.Linear(a, b) for i, (a, b) in enumerate(pairwise(sizes))})
         if settings.kind == "vertex":
             latent = d
             self.k: nn.Module = (
@@ -100,7 +100,9 @@ class ScaleNet(nn.Module):
         """
         if self.settings.kind == "distance":
             return betas[:, :0]
-        z: Tensor = self.h(scale_inputs(betas, pose, style))
+        z = scale_inputs(betas, pose, style)
+        for layer in self.h.values():
+            z = functional.relu(layer(z))
         return z
 
     def forward(self, z: Tensor, body: Tensor, vertex: Tensor, distance: Tensor) -> Tensor:

@@ -160,11 +160,9 @@ def colliders(body: SmplBody, collider: Collider, poses: NDArray[np.floating], b
 
     As in `refu_core.realtime.dress`, overlaps are pulled apart in the root's frame, before the root's rotation.
     """
-    shape = _alone(betas)
-    turns, at_root = RootTurn.taken_off(torch.as_tensor(poses, dtype=torch.float32), body.rest_joints(shape))
-    posed = body(at_root, shape)
+    posed = body.posed(torch.as_tensor(poses, dtype=torch.float32), body.shape(_alone(betas)), in_root=True)
     found = collider(posed.vertices, posed.transforms)
-    return np.stack([turn.to_host(one) for turn, one in zip(turns, found, strict=True)])
+    return np.stack([turn.to_host(one) for turn, one in zip(RootTurn.taken_off(posed), found, strict=True)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_JOINTS
 from refu_core.garments import N_STYLES, GarmentTemplate, SkinBelow, load_garment
-from refu_core.realtime import RootTurn
 from refu_core.simulation import GarmentDataset, GarmentSequences, SamplePlan, dequantise, open_dataset
 from refu_core.training._loop import seeded
 from refu_core.training._mirror import Mirror as Mirror
@@ -158,7 +157,7 @@ class TakenAlong:
     def added(self, sign: int, displacement: Tensor, betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
         """Displacements (B, N, 3) [m] with it, or, with a `sign` of -1, simulated ones without it."""
         garment, shape = self._garment, self._body.shape(betas)
-        posed = self._body.posed(RootTurn.taken_off(pose, shape.joints)[1], shape)
+        posed = self._body.posed(pose, shape, in_root=True)
         shift = self._below(self._collider(posed.vertices, posed.transforms) - posed.vertices)
         rest = garment.rest(betas, garment.own(style))
         vertices = garment.pose(rest + displacement, posed.transforms) + sign * shift

@@ -31,6 +31,7 @@ from refu_core.body import (
     weight_of_parts,
 )
 from refu_core.body._model import BodyArrays
+from refu_core.realtime import RootTurn
 
 ASSETS = Path(__file__).parents[2] / "refu_core" / "assets"
 
@@ -341,3 +342,23 @@ def test_faces_are_of_the_segment_that_moves_them() -> None:
     assert head[:, 1].min() > joints[3, 1]  # above the lowest vertebra
     assert left_forearm[:, 0].min() > joints[16, 0]  # farther out than the shoulder
     torch.testing.assert_close(weight_of_parts(body.weights, parts).sum(1), torch.ones(body.n_vertices))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_body_posed_in_its_roots_axes_is_turned_to_where_it_is(dtype: torch.dtype) -> None:
+    """About the root, which stays; by kernels, and where derivatives are wanted."""
+    drawn = torch.Generator().manual_seed(0)
+    pose, betas = (torch.randn(2, *row, generator=drawn, dtype=dtype) for row in ((24, 3), (10,)))
+    body = load_body("male", dtype=dtype)
+    shape = body.shape(betas)
+    wanted = body.posed(pose, shape)
+    for told in (pose, pose.clone().requires_grad_()):
+        at_root = body.posed(told, shape, in_root=True)
+        torch.testing.assert_close(at_root.rotations, wanted.rotations)
+        torch.testing.assert_close(at_root.joints[:, 0], shape.joints[:, 0])
+        for turn, inside, outside in zip(RootTurn.taken_off(at_root), at_root.vertices, wanted.vertices, strict=True):
+            torch.testing.assert_close(turn(inside), outside, atol=1e-5, rtol=0)
+            torch.testing.assert_close(turn(inside[::2]), turn(inside)[::2])
+            assert turn(inside).requires_grad == told.requires_grad
+            with pytest.raises(RuntimeError):
+                turn(inside.T)

@@ -64,7 +64,7 @@ def test_shapes_are_as_many_as_poses_or_one(n_poses: int, n_shapes: int, body: S
 
 def test_rotations_are_of_24_joints(body: SmplBody) -> None:
     with pytest.raises(FrameError, match="wanted rotations"):
-        forward_kinematics(torch.eye(3).repeat(1, 22, 1, 1), torch.zeros(1, 22, 3))
+        forward_kinematics(torch.zeros(1, 22, 3), torch.zeros(1, 22, 3))
     with pytest.raises(FrameError, match="rotation vectors must"):
         body.posed(torch.zeros(1, 72), body.shape(torch.zeros(1, 10)))
     with pytest.raises(FrameError, match="rotation vectors must"):

@@ -114,8 +114,8 @@ def test_a_batch_is_dressed_as_the_parts_would_one_by_one(
     betas, pose, style = bodies(2)
     dressed = dresser(betas, pose, style)
     # An approximate distance is that of the axes that it is asked in: the root's, as everywhere.
-    turns, at_root = RootTurn.taken_off(pose, body.rest_joints(betas))
-    posed, exact, approx, rest_faces = body(at_root, betas), ExactSdf(body.faces), ApproxSdf(body), RestFaces(body)
+    posed = body.posed(pose, body.shape(betas), in_root=True)
+    turns, exact, approx, rest_faces = RootTurn.taken_off(posed), ExactSdf(body.faces), ApproxSdf(body), RestFaces(body)
     unposed = garment.rest(betas, style) + backbone.inward
     raw = garment.pose(unposed, posed.transforms)
     apart = Collider(body)(posed.vertices, posed.transforms)
