@@ -20,15 +20,17 @@ class Winding(Unpicklable):
     common with the signs by which garments are brought off the body, nor with the faces found for that.
     """
 
-    def __init__(self, faces: Tensor) -> None:
+    def __init__(self, faces: Tensor, vertices: Tensor | None = None) -> None:
         """For bodies of these `faces`, shape (F, 3), on their device.
+
+        `vertices`, float32 (V, 3), is memory that poses [m] are in; by default it is this one's own, for `update`.
 
         Raises `MeshError` when they aren't a closed, consistently oriented surface.
         """
         mesh = Connectivity.of(faces.cpu())
         mesh.require_closed()
         device = faces.device
-        self._body = memory(mesh.n_vertices, 3, device=device)
+        self._body = memory(mesh.n_vertices, 3, device=device) if vertices is None else vertices
         # The first point of each cell, the least distance in it, and the box around all points; of no points at first.
         n = 2 * _N_CELLS**2
         self._empty, self._cells = memory(2, 2 * n + 6, dtype=torch.int32, device=device)
@@ -53,7 +55,6 @@ class Winding(Unpicklable):
         """Takes over a pose: the body's vertices [m], shape (V, 3)."""
         self._body.copy_(vertices.detach()[: len(self._body)])
 
-    @torch.no_grad()
     def __call__(self, points: Tensor, wanted: Tensor | None = None) -> Tensor:
         """The winding numbers of points [m], shape (N, 3): int32, (N,). A GPU isn't waited for.
 
