@@ -10,7 +10,7 @@ from torch import Tensor
 
 from refu_core._warp import IN_ROW, Repeated, Unpicklable, as_warp, memory
 from refu_core.mesh import Connectivity
-from refu_core.sdf._winding_kernels import CELLS, STEPS, Cells, winding_kernel
+from refu_core.sdf._winding_kernels import CELLS, STEPS, Bins, winding_kernel
 
 
 class Winding(Unpicklable):
@@ -32,11 +32,11 @@ class Winding(Unpicklable):
         device = faces.device
         self._body = memory(mesh.n_vertices, 3, device=device) if vertices is None else vertices
         where, n_cells, n = str(device), 2 * int(CELLS) ** 2, len(mesh.faces)
-        cells = Cells()
-        cells.first = wp.empty(n_cells, dtype=wp.int32, device=where)
-        cells.nearest = wp.empty(n_cells, dtype=wp.float32, device=where)
-        cells.box = wp.empty(2, dtype=wp.vec3, device=where)
-        self._known = as_warp(self._body, wp.vec3), wp.array(mesh.faces, dtype=wp.vec3i, device=where), cells
+        bins = Bins()
+        bins.first = wp.empty(n_cells, dtype=wp.int32, device=where)
+        bins.nearest = wp.empty(n_cells, dtype=wp.float32, device=where)
+        bins.box = wp.empty(2, dtype=wp.vec3, device=where)
+        self._known = as_warp(self._body, wp.vec3), wp.array(mesh.faces, dtype=wp.vec3i, device=where), bins
         # On a GPU a thread takes one face, but many points while it looks for their box.
         strides = [-(-n // IN_ROW) if step == 1 else n for step in range(STEPS)]
         self._steps = self._launches([(-1, 1)] if device.type == "cpu" else [*enumerate(strides)])

@@ -18,13 +18,13 @@ from refu_core.sdf._crossing_kernels import double
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CELLS = wp.constant(64)
-"""Cells of the grid along x and along y."""
+"""Bins of the grid along x and along y."""
 STEPS = 4
 _ZERO = wp.constant(wp.float64(0.0))
 
 
 @wp.struct
-class Cells:
+class Bins:
     """The points by cell: first those in front, then those behind."""
 
     first: wp.array[int]
@@ -70,7 +70,7 @@ def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, half: int) -> int:
 
 @wp.func
 def per_metre_of(box: wp.array[wp.vec3]) -> wp.vec3:
-    """Cells per metre; a hair fewer than there are, so that the last point is in the last cell."""
+    """Bins per metre; a hair fewer than there are, so that the last point is in the last cell."""
     extent = box[1] - box[0]
     cells = wp.static(0.9999 * CELLS)
     return wp.vec3(
@@ -79,17 +79,17 @@ def per_metre_of(box: wp.array[wp.vec3]) -> wp.vec3:
 
 
 @wp.func
-def enlist(q: int, points: wp.array[wp.vec3], following: wp.array[int], cells: Cells) -> None:
+def enlist(q: int, points: wp.array[wp.vec3], following: wp.array[int], bins: Bins) -> None:
     """Lists a point by its cell."""
     p = points[q]
-    low = cells.box[0]
-    per_metre = per_metre_of(cells.box)
-    ahead = p[2] - 0.5 * (low[2] + cells.box[1][2])
+    low = bins.box[0]
+    per_metre = per_metre_of(bins.box)
+    ahead = p[2] - 0.5 * (low[2] + bins.box[1][2])
     cell = cell_along(p[1], low[1], per_metre[1]) * CELLS + cell_along(p[0], low[0], per_metre[0])
     if ahead < 0.0:
         cell += CELLS * CELLS
-    following[q] = wp.atomic_exch(cells.first, cell, q)
-    wp.atomic_min(cells.nearest, cell, wp.abs(ahead))
+    following[q] = wp.atomic_exch(bins.first, cell, q)
+    wp.atomic_min(bins.nearest, cell, wp.abs(ahead))
 
 
 @wp.func
@@ -100,13 +100,13 @@ def look_through(
     faces: wp.array[wp.vec3i],
     points: wp.array[wp.vec3],
     following: wp.array[int],
-    cells: Cells,
+    bins: Bins,
     winding: wp.array[int],
 ) -> None:
     """Each face adds itself to the winding numbers of the points that look through it."""
-    low = cells.box[0]
-    high = cells.box[1]
-    per_metre = per_metre_of(cells.box)
+    low = bins.box[0]
+    high = bins.box[1]
+    per_metre = per_metre_of(bins.box)
     middle = 0.5 * (low[2] + high[2])
     for f in range(begin, faces.shape[0], stride):
         corners = faces[f]
@@ -128,8 +128,8 @@ def look_through(
                     for j in range(j0, j1 + 1):
                         row = (half * CELLS + j) * CELLS
                         for cell in range(row + i0, row + i1 + 1):
-                            if cells.nearest[cell] <= reach:
-                                q = int(cells.first[cell])
+                            if bins.nearest[cell] <= reach:
+                                q = int(bins.first[cell])
                                 while q >= 0:
                                     p = points[q]
                                     # Most points are ruled out by this test, and few by those after it.
@@ -148,7 +148,7 @@ def winding_kernel(
     stride: int,
     body: wp.array[wp.vec3],
     faces: wp.array[wp.vec3i],
-    cells: Cells,
+    bins: Bins,
     wanted: wp.array[int],
     points: wp.array[wp.vec3],
     following: wp.array[int],
@@ -162,19 +162,19 @@ def winding_kernel(
     low = points[0]
     high = low
     if only < 0 or only == 0:
-        for cell in range(begin, cells.first.shape[0], stride):
-            cells.first[cell] = -1
-            cells.nearest[cell] = wp.inf
-        cells.box[0] = low
-        cells.box[1] = high
+        for cell in range(begin, bins.first.shape[0], stride):
+            bins.first[cell] = -1
+            bins.nearest[cell] = wp.inf
+        bins.box[0] = low
+        bins.box[1] = high
     if only < 0 or only == 1:
         for q in range(begin, points.shape[0], stride):
             low = lesser(low, points[q])
             high = greater(high, points[q])
-        wp.atomic_min(cells.box, 0, low)
-        wp.atomic_max(cells.box, 1, high)
+        wp.atomic_min(bins.box, 0, low)
+        wp.atomic_max(bins.box, 1, high)
     if only < 0 or only == 2:
         for q in range(begin, points.shape[0], stride):
-            enlist(q, points, following, cells)
+            enlist(q, points, following, bins)
     if only < 0 or only == 3:
-        look_through(begin, stride, body, faces, points, following, cells, winding)
+        look_through(begin, stride, body, faces, points, following, bins, winding)
