@@ -16,6 +16,7 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 import torch
 import warp as wp
+from numpy.typing import NDArray
 from torch import Tensor
 
 from refu_core._kernel_cache import guard, no_cache
@@ -86,6 +87,11 @@ def memory(*shape: int, device: Any = "cpu", dtype: torch.dtype = torch.float32)
     """
     with torch.inference_mode(False):
         return torch.zeros(*shape, device=device, dtype=dtype)
+
+
+def readable(counts: Tensor) -> NDArray[Any]:
+    """What kernels have counted, for a CPU, which reads it at once; nothing of a GPU, which would be waited for."""
+    return counts.numpy() if counts.device.type == "cpu" else np.zeros(0, np.int32)
 
 
 def refit(trees: Sequence[Any], device: torch.device) -> None:
@@ -163,21 +169,24 @@ class Repeated(threading.local):
             return
         device = tensors[0].device
         key = (device, *dim, *map(_shape_and_dtype, tensors))
-        if key not in self._known:
-            if len(self._known) >= _MOST_SIZES:
-                self._known.clear()
-            given = [
-                wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False, return_ctype=True)
-                for tensor, kind in zip(tensors, self._kinds, strict=True)
-            ]
-            command = Recorded(self._kernel, dim, [*self._fixed, *given], device)
-            self._known[key] = command, [command.argument(len(self._fixed) + i) for i in range(len(given))]
-        command, arrays = self._known[key]
+        command, arrays = self._known.get(key) or self._prepared(key, dim, tensors)
         command.kept = self._fixed, tensors
         for array, tensor in zip(arrays, tensors, strict=True):
             array.data = tensor.data_ptr()
         with torch_stream(device):
             command.launch()
+
+    def _prepared(self, key: Any, dim: Sequence[int], tensors: Sequence[Tensor]) -> tuple[Recorded, list[Any]]:
+        """The launch for these sizes, and the arrays among its arguments."""
+        if len(self._known) >= _MOST_SIZES:
+            self._known.clear()
+        given = [
+            wp.from_torch(tensor.detach(), dtype=kind, requires_grad=False, return_ctype=True)
+            for tensor, kind in zip(tensors, self._kinds, strict=True)
+        ]
+        command = Recorded(self._kernel, dim, [*self._fixed, *given], tensors[0].device)
+        self._known[key] = command, [command.argument(len(self._fixed) + i) for i in range(len(given))]
+        return self._known[key]
 
 
 _shape_and_dtype = operator.attrgetter("shape", "dtype")
@@ -211,7 +220,7 @@ def is_plain(*tensors: Tensor) -> bool:
 
 def torch_stream(device: torch.device) -> contextlib.AbstractContextManager[Any]:
     """Queues Warp's work on torch's current CUDA stream, so that the two keep their order; nothing to do on a CPU."""
-    if device.type != "cuda":
+    if device == _CPU or device.type != "cuda":  # to ask for its type takes ten times as long
         return _NO_STREAM
     stream = _same_stream(torch.cuda.current_stream(device))
     # While torch captures a graph, work on another stream can't be waited for.
@@ -221,6 +230,7 @@ def torch_stream(device: torch.device) -> contextlib.AbstractContextManager[Any]
     return scope
 
 
+_CPU = torch.device("cpu")
 _NO_STREAM = contextlib.nullcontext()
 
 

@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from refu_core._cache import remembered
-from refu_core._warp import Repeated, as_torch, as_warp, ints, memory
+from refu_core._warp import Repeated, as_torch, as_warp, ints, memory, readable
 from refu_core.body import _collider_kernels as kernels
 from refu_core.body import _part_kernels as parting
 from refu_core.body._aside import Aside
@@ -242,6 +242,7 @@ class Memory:
         self.ints = memory(n_ints + kernels.FRONT + n_rounds + 1, dtype=torch.int32, device=device)
         """All that is set to zero at the start of every call."""
         self.counts = self.ints[n_ints:]
+        self.read_counts = readable(self.counts)
         self.work = work = kernels.Work()
         for name in ("skin", "points", "here", "there"):
             setattr(work, name, as_warp(getattr(self, name), wp.vec3))

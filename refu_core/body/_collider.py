@@ -70,9 +70,10 @@ class Collider(Unpicklable):
 
         Differentiable.
         """
-        if not len(skin):
+        given = [*zip(skin, rotation, strict=True)]
+        found = [self.anatomy.aside(*one) for one in given]
+        if all(new[0] is old[0] for new, old in zip(found, given, strict=True)):
             return skin, rotation
-        found = [self.anatomy.aside(one, turn) for one, turn in zip(skin, rotation, strict=True)]
         skins, turns = zip(*found, strict=True)
         return torch.stack(skins), torch.stack(turns)
 
@@ -94,7 +95,7 @@ class Collider(Unpicklable):
         work.ints.zero_()
         with torch_stream(self.device):
             self._run("between")
-            if self._is_serial and not work.counts[kernels.BENT_JOINTS]:
+            if self._is_serial and not work.read_counts[kernels.BENT_JOINTS]:
                 return skin
             work.take(skin)
             self._run("unfold")
@@ -105,7 +106,7 @@ class Collider(Unpicklable):
     def _touch(self) -> None:
         """Finds which segments each vertex has to give way to."""
         self._run("look")
-        wanted = int(self.anatomy.memory.counts[kernels.WANTED]) if self._is_serial else -1
+        wanted = int(self.anatomy.memory.read_counts[kernels.WANTED]) if self._is_serial else -1
         refit([tree for k, tree in enumerate(self.anatomy.trees) if (wanted >> k) & 1], self.device)
         if wanted:
             self._run("touch")

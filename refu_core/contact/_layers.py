@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refu_core._cache import remembered
-from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, readable, torch_stream
 from refu_core.contact import _layers_kernels as kernels
 from refu_core.contact._parting import Parting
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
@@ -59,6 +59,7 @@ class Layer(Unpicklable):
         n = len(above)
         self._given, self._points, self._push, *self._fields = memory(5, n, 3, device=self.device)
         self._count = memory(1, dtype=torch.int32, device=self.device)
+        self._read_count = readable(self._count)
         data = kernels.Above()
         data.given, data.points, data.push, data.field, data.smoother = (
             as_warp(rows, wp.vec3) for rows in (self._given, self._points, self._push, *self._fields)
@@ -95,7 +96,7 @@ class Layer(Unpicklable):
             self._commands["lift"].launch()
             n_low = self._count.clone()
             if self._is_serial:
-                if not int(n_low):
+                if not self._read_count[0]:
                     return above, n_low
                 self._commands["move all"].launch()
             else:

@@ -35,7 +35,7 @@ class OwnSide:
 
     def is_any_deep(self, distance: Tensor) -> bool:
         """Whether any vertex goes any part of its way, for their signed distances [m], shape (V,)."""
-        return bool((distance < -self._reach).any())
+        return float((distance + self._reach).min()) < 0
 
     def share(self, distance: Tensor) -> Tensor:
         """How much of its way each vertex goes, for its signed distance [m]; both of shape (V,).

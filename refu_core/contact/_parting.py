@@ -8,7 +8,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, readable, torch_stream
 from refu_core.contact import _parting_kernels as kernels
 from refu_core.contact._settings import ContactSettings
 from refu_core.contact._sheet import Sheet, cut_of
@@ -33,6 +33,7 @@ class Parting(Unpicklable):
         self._points = memory(n, 3, device=rest.device)
         self._marked = memory(n, device=rest.device)
         self._count = memory(1, dtype=torch.int32, device=rest.device)
+        self._read_count = readable(self._count)
         self._ways = memory(2, n_faces, 3, device=rest.device)
         data = kernels.Outer()
         data.points, data.way, data.place = (as_warp(rows, wp.vec3) for rows in (self._points, *self._ways))
@@ -71,7 +72,7 @@ class Parting(Unpicklable):
             for _ in range(self._settings.sweeps):
                 self._count.zero_()
                 self._commands["measure"].launch()
-                if self._is_serial and not int(self._count):
+                if self._is_serial and not self._read_count[0]:
                     break
                 self._commands["part"].launch()
         return self._points.clone()

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, refit, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, ints, memory, readable, refit, torch_stream
 from refu_core.body import ARMS, LEGS, SmplBody, joints_of, part_of_faces, weight_of_parts
 from refu_core.body._bundle_kernels import bound_kernel, enclose_kernel
 from refu_core.body._bundles import bundled
@@ -30,7 +30,8 @@ class LimbMeshes(Unpicklable):
         """For poses of this body, on its device; each of the limbs is given by its joints."""
         self._device = str(body.device)
         self._vertices = memory(*body.v_template.shape, device=body.device).copy_(body.v_template)
-        self._is_late = np.zeros(len(limbs), np.bool_)
+        self._late = 0
+        """Which meshes aren't fitted to the pose, as bits."""
         points = as_warp(self._vertices, wp.vec3)
         limb_of = part_of_faces(body.weights, body.faces, limbs).cpu().numpy()
         faces = body.faces.cpu().numpy()
@@ -48,16 +49,16 @@ class LimbMeshes(Unpicklable):
     def update(self, body: Tensor) -> None:
         """Takes over a pose: vertices (V, 3) [m]. A GPU isn't waited for."""
         self._vertices.copy_(body)
-        self._is_late[:] = True
+        self._late = -1
         with torch_stream(self._vertices.device):
             for command in self._fit:
                 command.launch()
 
     def pose(self, which: int) -> None:
         """Refits the meshes of the limbs `which`, given as bits, unless they are fitted already."""
-        late = [k for k in np.flatnonzero(self._is_late) if (which >> k) & 1]
-        refit([self.meshes[k] for k in late], self._vertices.device)
-        self._is_late[late] = False
+        late = which & self._late
+        refit([mesh for k, mesh in enumerate(self.meshes) if (late >> k) & 1], self._vertices.device)
+        self._late &= ~late
 
 
 class Press(Unpicklable):
@@ -84,6 +85,7 @@ class Press(Unpicklable):
         self._skin, self._points = memory(2, n, 3, device=self.device)
         self._cut = memory(2, n, device=self.device)
         self._counts = memory(kernels.N_COUNTS, dtype=torch.int32, device=self.device)
+        self._read_counts = readable(self._counts)
         own = weight_of_parts(garment.weights, _LIMBS) > 0
         foreign = (~own).cpu().numpy() @ (1 << np.arange(len(_LIMBS)))
         order, ring = grouped_at_rest(garment.v_template.cpu().numpy()), garment.mesh.ring
@@ -132,13 +134,13 @@ class Press(Unpicklable):
         self._counts.zero_()
         with torch_stream(self.device):
             self._commands["look"].launch()
-            wanted = int(self._counts[kernels.WANTED]) if self._is_serial else -1
+            wanted = int(self._read_counts[kernels.WANTED]) if self._is_serial else -1
             if not wanted:
                 return points
             self._limbs.pose(wanted)
             if self._is_serial:
                 self._commands["press all"].launch()
-                if not self._counts[kernels.PRESSED]:
+                if not self._read_counts[kernels.PRESSED]:
                     return points
             else:
                 self._cut.zero_()

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core._warp import Recorded, Repeated, Unpicklable, as_warp, ints, memory, torch_stream
+from refu_core._warp import Recorded, Repeated, Unpicklable, as_warp, ints, memory, readable, torch_stream
 from refu_core.contact import _edge_kernels, _parting_kernels, _resolver_kernels, _round_kernels, _state
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.errors import MeshError, require_type
@@ -32,7 +32,7 @@ class Resolution(NamedTuple):
     face: Tensor
     """The body's closest face, int32, shape (N,); -1 where none is known."""
     numbers: Tensor
-    """`n_inside`, `n_pushed`, `n_unresolved` and `max_depth`, shape (4,), on the garment's device."""
+    """`n_inside`, `n_pushed`, `n_unresolved`, `max_depth` and `n_clipped`, shape (5,), on the garment's device."""
 
     @property
     def n_inside(self) -> int:
@@ -53,6 +53,11 @@ class Resolution(NamedTuple):
     def max_depth(self) -> float:
         """Depth of the deepest vertex before [m], 0 where none was inside."""
         return float(self.numbers[3])
+
+    @property
+    def n_clipped(self) -> int:
+        """Vertices so far off that their distance wasn't known before."""
+        return int(self.numbers[4])
 
 
 class Resolver(Unpicklable):
@@ -94,11 +99,14 @@ class Resolver(Unpicklable):
         state.rise = wp.zeros(e, dtype=wp.vec3, device=str(self.device))
         # On a CPU a kernel is one thread and can do several short steps, and reading a number costs nothing.
         self._is_serial = self.device.type == "cpu"
-        self._read_counts = self._counts.numpy() if self._is_serial else np.zeros(0)
+        self._n_threads, each = (1, n) if self._is_serial else (n, 1)
+        self._result = self._vectors["place"], self._floats["distance"], self._vectors["gradient"], self._ints["face"]
+        kinds = (wp.vec3, wp.float32, wp.vec3, wp.int32, wp.float32)
+        self._conclude = Repeated(_resolver_kernels.conclude_kernel, kinds, [each, state])
+        self._read_counts = readable(self._counts)
         self._known: dict[tuple[Any, float], dict[str, Any]] = {}
         self._last_sdf: MeshSdf | None = None
-        self._is_torn = False
-        """Whether the last call was interrupted, and may have left what it worked with behind."""
+        """That of the last call; None if that was interrupted, and may have left what it worked with behind."""
 
     @torch.no_grad()
     def __call__(
@@ -124,29 +132,26 @@ class Resolver(Unpicklable):
 
         Raises:
             MeshError: points that are of the wrong number or type, or not finite; a negative margin; a distance that
-                isn't to faces; or no start though the last call wasn't for this `sdf`.
+                isn't to faces; or no start though the last call wasn't for this `sdf`, or was interrupted.
         """
         require_tensor("points", points)
         distances = self._floats["distance"] if start is None else start.distance
         if points.shape != (self._n_vertices, 3) or distances.shape != (self._n_vertices,):
             shapes = f"{tuple(points.shape)} and {tuple(distances.shape)}"
             raise MeshError(f"wanted {self._n_vertices} points and their distances, got the shapes {shapes}")
-        if self._is_serial:  # a GPU would have to be waited for
-            require_finite("points", points)
         require_margin(margin)
         require_type(sdf, MeshSdf, "a distance to faces, such as an ExactSdf", error=MeshError)
         if start is None and sdf is not self._last_sdf:
-            msg = "nothing to go on from: the last call wasn't for this sdf; give what it says of the points as start"
-            raise MeshError(msg)
-        self._last_sdf = sdf
+            why = "the last call wasn't for this sdf, or was interrupted"
+            raise MeshError(f"nothing to go on from: {why}; give what it says of the points as start")
+        is_torn, self._last_sdf = self._last_sdf is None, None
         with torch_stream(self.device):
             self._commands = self._launches(sdf.skin(), margin)
             self._counts.zero_()
-            if self._is_torn:
+            if is_torn:
                 for left in (self._vectors["field"], self._vectors["smoother"], self._floats["largest"]):
                     left.zero_()
                 self._ints["mark"].zero_()
-            self._is_torn = True
             if not self._is_serial:
                 self._bounds.zero_()
             self._vectors["origin"].copy_(points)
@@ -159,6 +164,8 @@ class Resolver(Unpicklable):
                 self._vectors["first_gradient"].copy_(start.gradient)
                 torch.clamp(start.face, max=len(sdf.faces) - 1, out=self._ints["first_face"])  # maybe of another body
                 self._run("begin")
+            if self._is_serial and self._count(_state.ASTRAY):  # a GPU would have to be waited for
+                require_finite("points", points)
             if not sdf.is_exact:
                 self._reconcile()
             self._run("list")
@@ -167,17 +174,12 @@ class Resolver(Unpicklable):
                 self._push(n, scale)
             if n or self._length(_state.SHIFTED):
                 self._raise_edges()
-            if n:
-                self._run("tally")
-        self._is_torn = False
-        depth = -self._floats["first"].amin(0, keepdim=True)
-        counts = self._counts[_state.INSIDE : _state.STUCK + 1].float()
-        numbers = torch.cat((counts, depth.clamp_min(0)))
-        found = self._vectors["place"], self._floats["distance"], self._vectors["gradient"], self._ints["face"]
-        vertices, distance, gradient, face = (one.clone() for one in found)
-        return Resolution(vertices, distance, gradient, face, numbers)
+        vertices, distance, gradient, face = map(torch.empty_like, self._result)
+        result = Resolution(vertices, distance, gradient, face, distance.new_zeros(5))
+        self._conclude((self._n_threads,), *result)
+        self._last_sdf = sdf
+        return result
 
-    @torch.no_grad()
     def glimpse(self, result: Resolution, points: Tensor, sdf: MeshSdf) -> Tensor:
         """How many faces with vertices `points` (N, 3) [m] are seen to cut the body last given to `sdf`, int32, (1,).
 
@@ -187,25 +189,22 @@ class Resolver(Unpicklable):
         """
         skin = sdf.skin()
         if self._glimpsed is not skin:
-            self._glimpsed, n = skin, len(self._faces)
-            self._n_threads, each = (1, n) if self._is_serial else (n, 1)
-            kinds = (wp.vec3, wp.float32, wp.vec3, wp.int32, wp.int32)
+            self._glimpsed, kinds = skin, (wp.vec3, wp.float32, wp.vec3, wp.int32, wp.int32)
+            self._n_pieces, each = (1, len(self._faces)) if self._is_serial else (len(self._faces), 1)
             self._glimpse = Repeated(_parting_kernels.glimpse_kernel, kinds, [each, self._faces, skin])
         count = torch.zeros(1, dtype=torch.int32, device=self.device)
         far = result.distance
         if points is not result.vertices:
             has_moved = (points - result.vertices).norm(dim=1) > self._settings.tolerance
             far = torch.where(has_moved, 0.0, far)
-        self._glimpse((self._n_threads,), points.contiguous(), far, result.gradient, result.face, count)
+        self._glimpse((self._n_pieces,), points.contiguous(), far, result.gradient, result.face, count)
         return count
 
     def _reconcile(self) -> None:
         """Finds closest faces that were missed, where distances along an edge contradict each other."""
         self._run("compare")
         for _ in range(self._settings.max_pushes):
-            n = self._length(_state.SUSPECTS)
-            self._counts[_state.CHANGED].zero_()
-            if n:
+            if self._length(_state.SUSPECTS):
                 self._run("retry")
                 self._run("adopt")
             if self._is_serial and not self._count(_state.CHANGED):
@@ -213,10 +212,9 @@ class Resolver(Unpicklable):
 
     def _push(self, n: int, scale: float | VertexScale) -> None:
         """The `n` near vertices leave the body, and their neighbours follow."""
-        alpha = self._floats["alpha"][:n]
+        alpha = self._floats["alpha"][:n]  # so far the distances that α is predicted from
         if callable(scale):
-            rows = self._ints["near"][:n].long()
-            alpha.copy_(scale(rows, self._floats["distance"].index_select(0, rows)))
+            alpha.copy_(scale(self._ints["near"][:n], alpha))
         else:
             alpha.fill_(scale)
         self._run("scale")
@@ -288,7 +286,6 @@ class Resolver(Unpicklable):
             "scale": (_resolver_kernels.scale_kernel, [each, state, rules]),
             "settle": (_resolver_kernels.settle_kernel, [each, state, skin, rules]),
             "suspect": (_edge_kernels.suspect_kernel, [each, state, cloth, rules]),
-            "tally": (_resolver_kernels.tally_kernel, [each, state]),
         }
         long_step, short_step = how.blend_steps
         if self._is_serial:

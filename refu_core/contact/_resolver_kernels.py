@@ -3,15 +3,13 @@
 import warp as wp
 
 from refu_core.contact._state import (
+    ASTRAY,
     BESIDE,
     CHANGED,
-    INSIDE,
-    MOVED,
     NEAR,
     REACHED,
     SHIFTED,
     SOURCE,
-    STUCK,
     SUSPECTS,
     Cloth,
     Rules,
@@ -21,8 +19,11 @@ from refu_core.contact._state import (
     length,
 )
 from refu_core.sdf import Skin, query_skin
+from refu_core.sdf._mesh import FARTHEST
 
 wp.set_module_options({"enable_backward": False})
+
+_FARTHEST_SQUARED = wp.constant(FARTHEST**2)
 
 
 @wp.func
@@ -61,6 +62,15 @@ def suspect(i: int, state: State) -> None:
         state.reached[wp.atomic_add(state.counts, SUSPECTS, 1)] = i
 
 
+@wp.func
+def is_astray(p: wp.vec3, state: State) -> bool:
+    """Whether a vertex is at NaN or too far off to compute with (`require_finite`); counts those."""
+    if wp.length_sq(p) <= _FARTHEST_SQUARED:
+        return False
+    wp.atomic_add(state.counts, ASTRAY, 1)
+    return True
+
+
 @wp.kernel
 def begin_kernel(each: int, state: State, skin: Skin) -> None:
     """Starts every vertex where it is; `each` vertices a thread, as in every kernel for all vertices (`strips`)."""
@@ -69,7 +79,8 @@ def begin_kernel(each: int, state: State, skin: Skin) -> None:
         here = state.origin[i]
         if state.first_face[i] < 0:
             state.first_gradient[i] = wp.vec3()  # beyond a band nothing is known
-        if not (state.first[i] > -wp.inf and wp.isfinite(state.first_gradient[i])):  # a caller's own may be NaN
+        is_known = state.first[i] > -wp.inf and wp.isfinite(state.first_gradient[i])  # a caller's own may be NaN
+        if not is_astray(here, state) and not is_known:
             distance, gradient, face = query_skin(skin, here, wp.max(state.first_face[i], 0))
             state.first[i] = distance
             state.first_gradient[i] = gradient
@@ -85,6 +96,8 @@ def go_on_kernel(each: int, reach: float, state: State, skin: Skin) -> None:
     for i in range(first, first + each):
         here = state.origin[i]
         way = wp.length(here - state.place[i])
+        if is_astray(here, state):
+            way = 0.0
         state.place[i] = here
         state.fresh[i] = wp.where(way > 0.0, 1, 0)
         if way > 0.0:
@@ -119,6 +132,7 @@ def retry_kernel(each: int, state: State, cloth: Cloth, skin: Skin, rules: Rules
 
     `each` entries of a list a thread, here and below.
     """
+    state.counts[CHANGED] = 0
     begin = wp.tid() * each
     for n in range(begin, wp.min(begin + each, length(SUSPECTS, state))):
         i = state.reached[n]
@@ -156,7 +170,9 @@ def list_near_kernel(each: int, state: State, rules: Rules) -> None:
     for i in range(first, first + each):
         state.mark[i] = 0
         if state.distance[i] < rules.margin and state.fresh[i] == 1:
-            state.near[wp.atomic_add(state.counts, NEAR, 1)] = i
+            k = wp.atomic_add(state.counts, NEAR, 1)
+            state.near[k] = i
+            state.alpha[k] = state.distance[i]
 
 
 @wp.func
@@ -282,15 +298,32 @@ def settle_kernel(each: int, state: State, skin: Skin, rules: Rules) -> None:
 
 
 @wp.kernel
-def tally_kernel(each: int, state: State) -> None:
-    """Counts the near vertices that were inside, that were moved, and that are still inside."""
+def conclude_kernel(
+    each: int,
+    state: State,
+    # outputs, the fields of a `Resolution`
+    vertices: wp.array[wp.vec3],
+    distance: wp.array[float],
+    gradient: wp.array[wp.vec3],
+    face: wp.array[int],
+    numbers: wp.array[float],
+) -> None:
+    """Hands the result out. Counts the near vertices that were inside, that were moved, and that are still inside."""
     begin = wp.tid() * each
     for k in range(begin, wp.min(begin + each, length(NEAR, state))):
         i = state.near[k]
+        if state.first[i] < 0.0:
+            wp.atomic_add(numbers, 0, 1.0)
         way = state.place[i] - state.origin[i]
         if way[0] != 0.0 or way[1] != 0.0 or way[2] != 0.0:
-            wp.atomic_add(state.counts, MOVED, 1)
-        if state.first[i] < 0.0:
-            wp.atomic_add(state.counts, INSIDE, 1)
+            wp.atomic_add(numbers, 1, 1.0)
         if state.distance[i] < 0.0:
-            wp.atomic_add(state.counts, STUCK, 1)
+            wp.atomic_add(numbers, 2, 1.0)
+    for i in range(begin, begin + each):
+        wp.atomic_max(numbers, 3, -state.first[i])
+        if state.first_face[i] < 0:
+            wp.atomic_add(numbers, 4, 1.0)
+        vertices[i] = state.place[i]
+        distance[i] = state.distance[i]
+        gradient[i] = state.gradient[i]
+        face[i] = state.face[i]

@@ -11,13 +11,11 @@ import warp as wp
 NEAR = wp.constant(0)  # vertices nearer than the margin, which are pushed
 REACHED = wp.constant(1)  # vertices that are pushed, or that a push reaches through neighbours
 SUSPECTS = wp.constant(2)  # vertices at the ends of edges along which distances contradict each other
-INSIDE = wp.constant(3)
-MOVED = wp.constant(4)  # vertices nearer than the margin that were moved
-STUCK = wp.constant(5)  # vertices still inside at the end
-RAISED = wp.constant(6)  # ends of edges that cut the skin
-CHANGED = wp.constant(7)  # distances that were replaced
-SHIFTED = wp.constant(8)  # vertices that were moved since the last call
-CUTTING = wp.constant(9)  # edges that may cut the skin; the counts of `max_pushes` rounds follow
+RAISED = wp.constant(3)  # ends of edges that cut the skin
+CHANGED = wp.constant(4)  # distances that were replaced
+SHIFTED = wp.constant(5)  # vertices that were moved since the last call
+ASTRAY = wp.constant(6)  # vertices that aren't anywhere near
+CUTTING = wp.constant(7)  # edges that may cut the skin; the counts of `max_pushes` rounds follow
 
 # Marks of a vertex: reached by a push, or pushed itself.
 BESIDE = wp.constant(1)
@@ -76,7 +74,7 @@ class State:
     reached: wp.array[wp.int32]
     """The lists; `reached` also holds the suspects before a push, and the raised ends of edges after it."""
     alpha: wp.array[wp.float32]
-    """The scale α of each vertex in `near`."""
+    """The scale α of each vertex in `near`; before that the distance that it is predicted from."""
     field: wp.array[wp.vec3]
     smoother: wp.array[wp.vec3]
     """How far vertices are taken along, and the same a sweep later; zero between frames."""

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Recorded, Unpicklable, as_warp, memory, torch_stream
+from refu_core._warp import Repeated, Unpicklable, as_warp, memory, readable
 from refu_core.contact import _strain_kernels as kernels
 from refu_core.contact._settings import DEFAULT_CONTACT, ContactSettings
 from refu_core.contact._sheet import cut_of
@@ -25,23 +25,17 @@ class StrainLimit(Unpicklable):
         self, mesh: Connectivity, device: torch.device, *, settings: ContactSettings = DEFAULT_CONTACT
     ) -> None:
         """For garments of this mesh."""
-        self._settings, self._device = settings, device
+        self._settings, self._n_vertices = settings, mesh.n_vertices
         self._is_serial = device.type == "cpu"
-        n = mesh.n_vertices
-        self._rest, self._before, self._points, self._other = memory(4, n, 3, device=device)
         self._count = memory(1, dtype=torch.int32, device=device)
+        self._read_count = readable(self._count)
         net = kernels.Net()
         net.cut = cut_of(mesh, device)
-        net.rest, net.before, net.points, net.other = (
-            as_warp(one, wp.vec3) for one in (self._rest, self._before, self._points, self._other)
-        )
+        net.other = wp.zeros(mesh.n_vertices, dtype=wp.vec3, device=str(device))
         net.limit, net.count = settings.strain_limit, as_warp(self._count, wp.int32)
-        net.rows, net.is_listed = (wp.zeros(n, dtype=wp.int32, device=str(device)) for _ in range(2))
-        self._limit = Recorded(kernels.limit_kernel, 1, [net, settings.sweeps], device)
-        self._sweeps = [
-            Recorded(kernels.sweep_kernel, n, [net, *places], device)
-            for places in ((net.points, net.other), (net.other, net.points))
-        ]
+        net.rows, net.is_listed = (wp.zeros(mesh.n_vertices, dtype=wp.int32, device=str(device)) for _ in range(2))
+        self._limit = Repeated(kernels.limit_kernel, [wp.vec3] * 4, [net, settings.sweeps])
+        self._sweep = Repeated(kernels.sweep_kernel, [wp.vec3] * 4, [net])
 
     @torch.no_grad()
     def __call__(self, points: Tensor, before: Tensor, rest: Tensor) -> Tensor:
@@ -49,17 +43,13 @@ class StrainLimit(Unpicklable):
 
         `before` (N, 3) [m] are its vertices before contact, `rest` (N, 3) [m] those of the wearer's garment at rest.
         """
-        self._points.copy_(points)
-        self._before.copy_(before)
-        self._rest.copy_(rest)
-        with torch_stream(self._device):
-            if self._is_serial:
-                self._count.zero_()
-                self._limit.launch()
-                if not int(self._count):
-                    return points
-            else:
-                for sweep in range(self._settings.sweeps):
-                    self._sweeps[sweep % 2].launch()
-        limited: Tensor = self._points.clone()
-        return limited
+        given, before, rest = (one.contiguous() for one in (points, before, rest))
+        if self._is_serial:
+            limited = torch.empty_like(given)
+            self._limit((1,), given, before, rest, limited)
+            return limited if self._read_count[0] else points
+        for _ in range(self._settings.sweeps):
+            limited = torch.empty_like(given)
+            self._sweep((self._n_vertices,), given, before, rest, limited)
+            given = limited
+        return given

@@ -11,7 +11,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refu_core._warp import Recorded, Unpicklable, as_warp, memory, torch_stream
+from refu_core._warp import Recorded, Unpicklable, as_warp, memory, readable, torch_stream
 from refu_core.body import PARENTS, JointWeights
 from refu_core.contact import _layers_kernels as layers
 from refu_core.contact import _unfold_kernels as kernels
@@ -43,6 +43,7 @@ class Unfold(Unpicklable):
         self._points, self._other, self._origin, normals = memory(4, n, 3, device=device)
         self._rotation = memory(len(PARENTS), 3, 3, device=device)
         self._count = memory(1, dtype=torch.int32, device=device)
+        self._read_count = readable(self._count)
         fold = kernels.Fold()
         fold.points, fold.leveller, fold.origin, fold.normal = (
             as_warp(one, wp.vec3) for one in (self._points, self._other, self._origin, normals)
@@ -80,7 +81,7 @@ class Unfold(Unpicklable):
             self._count.zero_()
             self._commands["fold"].launch()
             if self._is_serial:
-                if not int(self._count):
+                if not self._read_count[0]:
                     return points
                 self._commands["unfold all"].launch()
             else:

@@ -25,7 +25,7 @@ class WayOut(Unpicklable):
         """For poses of this `skin`, on its device. Raises `MeshError` unless it is closed and consistently oriented."""
         self._skin, self._settings, self.device = skin, settings, skin.vertices.device
         self._is_serial = self.device.type == "cpu"
-        self._winding = Winding(torch.as_tensor(skin.mesh.faces, device=self.device))
+        self._winding = Winding(torch.as_tensor(skin.mesh.faces, device=self.device), skin.vertices)
         n_places = len(skin.vertices) + len(skin.mesh.faces)
         self._above = memory(n_places, 3, device=self.device)
         above, known = as_warp(self._above, wp.vec3), skin.data
@@ -34,10 +34,6 @@ class WayOut(Unpicklable):
         fixed = [known.tree, settings.max_displacement, known.points, known.cut.faces, above]
         kinds = (wp.int32, wp.vec3, wp.int32, wp.vec3, wp.vec3)
         self._nearest = [Repeated(kernels.nearest_kernel, kinds, [*fixed, of_samples]) for of_samples in (False, True)]
-
-    def update(self) -> None:
-        """Takes over the pose that the skin has taken."""
-        self._winding.update(self._skin.vertices)
 
     @torch.no_grad()
     def __call__(self, points: Tensor, around: Tensor, margin: float) -> tuple[Tensor, Tensor]:

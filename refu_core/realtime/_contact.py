@@ -117,8 +117,6 @@ class ContactStage:
         self._body, self._skin_of = body, {}
         self.sdf.update(body)
         self._skin.take(body)
-        if self.way_out is not None:
-            self.way_out.update()
         if self._has_room:
             self._limbs.update(body)
 
@@ -204,11 +202,9 @@ class ContactStage:
         vertices, start = self.own_side(name, vertices, on_mean, margin + ASKED_FROM)
         if vertices is not given:
             laid = laid + (vertices - given)
-        assert start.face is not None  # these distances are to faces
-        n_clipped = 0 if isinstance(self.sdf, ApproxSdf) else torch.count_nonzero(start.face < 0)
         resolver = self.resolvers[name]
         done = resolver(vertices, self.sdf, start, margin=margin, scale=scale)
-        numbers, kept = done.numbers, margin
+        numbers, n_clipped, kept = done.numbers[:4], done.numbers[4], margin
         if worn:
             vertices, _ = self.lift(name, done.vertices, worn, goes_on=True)
             kept = self._settings.layer_margin * margin

@@ -11,7 +11,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from refu_core._warp import Repeated, as_torch, as_warp, memory
+from refu_core._warp import Recorded, Repeated, as_torch, as_warp, memory, torch_stream
 from refu_core.body import SEGMENTS, SmplBody, part_of_faces
 from refu_core.errors import MeshError, require_type
 from refu_core.garments import GarmentTemplate
@@ -133,12 +133,14 @@ class ApproxSdf(MeshSdf):
         self._exact_is_late = True
         self._table.fill_(EMPTY)
         if is_new:
-            fixed = [self._posed.points, _CELL, _DEPTH]
-            self._enter = Repeated(enter_guides_kernel, (wp.vec4i, wp.int32), fixed)
+            guides = as_warp(self._guide_rows, wp.vec4i)
+            inputs = [self._posed.points, _CELL, _DEPTH, guides, self._guides.table]
+            self._enter = Recorded(enter_guides_kernel, len(guides), inputs, self.device)
             self._walk = Repeated(walk_kernel, (wp.vec3, wp.int32, wp.int32, *FOUND), [self._posed, self._guides])
             fixed = [self._exact_of_pose().mesh_id, self._posed, self._exact_from]
             self._ask_deep = Repeated(requery_deep_kernel, (wp.vec3, *FOUND), fixed)
-        self._enter((len(self._guide_rows),), self._guide_rows, self._table)
+        with torch_stream(self.device):
+            self._enter.launch()
 
     def _find(self, points: Tensor, near: Tensor | None) -> Found:
         if near is None:  # no near face is known: the exact query is right, if slow

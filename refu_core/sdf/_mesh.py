@@ -36,7 +36,7 @@ class Found(NamedTuple):
         return SdfSample(self.distance, self.gradient, self.face)
 
 
-_FARTHEST = 1e7
+FARTHEST = 1e7
 """Largest coordinate [m], so how far away a body may be. Its fourth power doesn't overflow yet."""
 FOUND = (wp.int32, wp.float32, wp.vec3)
 """The fields' types, as `Repeated` takes them."""
@@ -226,13 +226,13 @@ def require_finite(name: str, values: Tensor) -> None:
     """Raises `MeshError` where `values`, shape (N, 3) [m], aren't all finite, or are so large that squares overflow."""
     if values.is_cuda and torch.cuda.is_current_stream_capturing():
         return  # a CUDA graph can't wait for the answer; what it replays was checked where it came in
-    flat = values.detach().reshape(-1)
-    if float(torch.dot(flat, flat)) <= _FARTHEST**2:  # no square is larger than their sum, which is quick to know
+    values = values.detach()
+    if float(torch.linalg.vector_norm(values)) <= FARTHEST:  # no value is larger than the norm, which is quick to know
         return
-    largest = float(flat.abs().max())  # NaN if any value is
+    largest = float(values.abs().max())  # NaN if any value is
     if not math.isfinite(largest):
         bad = int((~torch.isfinite(values)).any(dim=-1).sum())
         raise MeshError(f"{name} must be finite, got {bad} of {len(values)} with NaN or infinite coordinates")
-    if largest > _FARTHEST:
-        msg = f"{name} must be within {_FARTHEST:.0e} m of the origin, got {largest:.3g} m; is the unit metres?"
+    if largest > FARTHEST:
+        msg = f"{name} must be within {FARTHEST:.0e} m of the origin, got {largest:.3g} m; is the unit metres?"
         raise MeshError(msg)

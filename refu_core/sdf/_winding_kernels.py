@@ -4,6 +4,9 @@ The points are listed by the cells of a grid over x and y, those of the front ha
 A point in front looks along +z, one behind along -z, so that most see nothing. Which faces a line crosses is decided
 in double precision, where differences of float32 are exact. Each edge gives both of its faces the same answer, so no
 line slips between two faces, or crosses both.
+
+On a CPU, where a launch costs as much as hundreds of points, one thread takes all steps (`only` is -1). On a GPU each
+launch takes one step, number `only`, and each of its `stride` threads takes every `stride`-th item.
 """
 
 import warp as wp
@@ -15,8 +18,21 @@ from refu_core.sdf._crossing_kernels import double
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CELLS = wp.constant(64)
-"""Cells of the grid along x and along y."""
+"""Bins of the grid along x and along y."""
+STEPS = 4
 _ZERO = wp.constant(wp.float64(0.0))
+
+
+@wp.struct
+class Bins:
+    """The points by cell: first those in front, then those behind."""
+
+    first: wp.array[int]
+    """The first point of each cell, -1 for none."""
+    nearest: wp.array[float]
+    """How near the points of each cell come to the middle plane [m]."""
+    box: wp.array[wp.vec3]
+    """The corners of the box around all points [m]."""
 
 
 @wp.func
@@ -53,83 +69,46 @@ def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, half: int) -> int:
 
 
 @wp.func
-def per_metre_of(grid: wp.array[wp.vec3]) -> wp.vec3:
-    """Cells per metre; a hair fewer than there are, so that the last point is in the last cell."""
-    extent = grid[1] - grid[0]
+def per_metre_of(box: wp.array[wp.vec3]) -> wp.vec3:
+    """Bins per metre; a hair fewer than there are, so that the last point is in the last cell."""
+    extent = box[1] - box[0]
     cells = wp.static(0.9999 * CELLS)
     return wp.vec3(
         cells / wp.max(extent[0], 1.0e-6), cells / wp.max(extent[1], 1.0e-6), cells / wp.max(extent[2], 1.0e-6)
     )
 
 
-@wp.kernel
-def extent_kernel(
-    wanted: wp.array[int],
-    each: wp.array[int],
-    points: wp.array[wp.vec3],
-    # output, which is infinite before
-    grid: wp.array[wp.vec3],
-) -> None:
-    """The corners of the box around the points. Like all of these kernels it does nothing where `wanted` is 0."""
-    if wanted[0] == 0:
-        return
-    begin = wp.tid() * each[0]
-    low = points[begin]
-    high = low
-    for q in range(begin + 1, wp.min(begin + each[0], points.shape[0])):
-        low = lesser(low, points[q])
-        high = greater(high, points[q])
-    wp.atomic_min(grid, 0, low)
-    wp.atomic_max(grid, 1, high)
-
-
-@wp.kernel
-def bin_kernel(
-    wanted: wp.array[int],
-    points: wp.array[wp.vec3],
-    grid: wp.array[wp.vec3],
-    # outputs
-    first: wp.array[int],
-    following: wp.array[int],
-    farthest_in: wp.array[float],
-) -> None:
-    """Lists the points by cell; `farthest_in` is the least distance of a cell's points from the middle plane."""
-    if wanted[0] == 0:
-        return
-    q = wp.tid()
+@wp.func
+def enlist(q: int, points: wp.array[wp.vec3], following: wp.array[int], bins: Bins) -> None:
+    """Lists a point by its cell."""
     p = points[q]
-    per_metre = per_metre_of(grid)
-    ahead = p[2] - 0.5 * (grid[0][2] + grid[1][2])
-    cell = cell_along(p[1], grid[0][1], per_metre[1]) * CELLS + cell_along(p[0], grid[0][0], per_metre[0])
+    low = bins.box[0]
+    per_metre = per_metre_of(bins.box)
+    ahead = p[2] - 0.5 * (low[2] + bins.box[1][2])
+    cell = cell_along(p[1], low[1], per_metre[1]) * CELLS + cell_along(p[0], low[0], per_metre[0])
     if ahead < 0.0:
         cell += CELLS * CELLS
-    following[q] = wp.atomic_exch(first, cell, q)
-    wp.atomic_min(farthest_in, cell, wp.abs(ahead))
+    following[q] = wp.atomic_exch(bins.first, cell, q)
+    wp.atomic_min(bins.nearest, cell, wp.abs(ahead))
 
 
-@wp.kernel
-def crossings_kernel(
-    each: int,
+@wp.func
+def look_through(
+    begin: int,
+    stride: int,
     body: wp.array[wp.vec3],
     faces: wp.array[wp.vec3i],
-    wanted: wp.array[int],
     points: wp.array[wp.vec3],
-    grid: wp.array[wp.vec3],
-    first: wp.array[int],
     following: wp.array[int],
-    farthest_in: wp.array[float],
-    # output
+    bins: Bins,
     winding: wp.array[int],
 ) -> None:
-    """Each face adds itself to the winding numbers of the points that look through it; `each` faces a thread."""
-    if wanted[0] == 0:
-        return
-    low = grid[0]
-    high = grid[1]
-    per_metre = per_metre_of(grid)
+    """Each face adds itself to the winding numbers of the points that look through it."""
+    low = bins.box[0]
+    high = bins.box[1]
+    per_metre = per_metre_of(bins.box)
     middle = 0.5 * (low[2] + high[2])
-    begin = wp.tid() * each
-    for f in range(begin, wp.min(begin + each, faces.shape[0])):
+    for f in range(begin, faces.shape[0], stride):
         corners = faces[f]
         a = body[corners[0]]
         b = body[corners[1]]
@@ -149,8 +128,8 @@ def crossings_kernel(
                     for j in range(j0, j1 + 1):
                         row = (half * CELLS + j) * CELLS
                         for cell in range(row + i0, row + i1 + 1):
-                            if farthest_in[cell] <= reach:
-                                q = int(first[cell])
+                            if bins.nearest[cell] <= reach:
+                                q = int(bins.first[cell])
                                 while q >= 0:
                                     p = points[q]
                                     # Most points are ruled out by this test, and few by those after it.
@@ -161,3 +140,41 @@ def crossings_kernel(
                                         if found != 0:
                                             wp.atomic_add(winding, q, found)
                                     q = following[q]
+
+
+@wp.kernel
+def winding_kernel(
+    only: int,
+    stride: int,
+    body: wp.array[wp.vec3],
+    faces: wp.array[wp.vec3i],
+    bins: Bins,
+    wanted: wp.array[int],
+    points: wp.array[wp.vec3],
+    following: wp.array[int],
+    # output, zeros before
+    winding: wp.array[int],
+) -> None:
+    """The winding numbers of the points, in `STEPS` steps; nothing is done where `wanted` is 0."""
+    if wanted[0] == 0:
+        return
+    begin = wp.tid()
+    low = points[0]
+    high = low
+    if only < 0 or only == 0:
+        for cell in range(begin, bins.first.shape[0], stride):
+            bins.first[cell] = -1
+            bins.nearest[cell] = wp.inf
+        bins.box[0] = low
+        bins.box[1] = high
+    if only < 0 or only == 1:
+        for q in range(begin, points.shape[0], stride):
+            low = lesser(low, points[q])
+            high = greater(high, points[q])
+        wp.atomic_min(bins.box, 0, low)
+        wp.atomic_max(bins.box, 1, high)
+    if only < 0 or only == 2:
+        for q in range(begin, points.shape[0], stride):
+            enlist(q, points, following, bins)
+    if only < 0 or only == 3:
+        look_through(begin, stride, body, faces, points, following, bins, winding)

@@ -11,6 +11,7 @@ from refu_core import GarmentPipeline, SmplFrame
 from refu_core.body import JOINT_NAMES
 from refu_core.realtime import PROMISED_POSES, within_promise
 from refu_core.sdf import Winding
+from refu_core.sdf._winding_kernels import STEPS
 from refu_lab.stress._frames import FRAMES, everyday, promised
 
 
@@ -72,6 +73,7 @@ def test_winding_numbers_are_libigls_on_vertices_edges_and_far_away() -> None:
         here = where.astype(np.float32)
         expected = igl.winding_number(body.astype(np.float64), faces.numpy(), here.astype(np.float64))
         assert np.array_equal(winding(torch.from_numpy(here)).numpy(), np.round(expected))
+        winding._steps = winding._launches([(step, 7) for step in range(STEPS)])  # as on a GPU
         for wanted in (0, 1):
             found = winding(torch.from_numpy(here), torch.tensor([wanted], dtype=torch.int32))
             assert np.array_equal(found.numpy(), wanted * np.round(expected)), "nothing is done where none is wanted"

@@ -143,7 +143,9 @@ def test_what_is_far_from_the_body_stays() -> None:
     assert not unasked.numbers.any()
     no_face = torch.full((len(away),), -1, dtype=torch.int32)
     clipped = SdfSample(sample.distance.clamp_max(0.008), sample.gradient, no_face)
-    assert torch.equal(worn("tshirt-male")[2](away, sdf, clipped).vertices, away)
+    unmoved = worn("tshirt-male")[2](away, sdf, clipped)
+    assert torch.equal(unmoved.vertices, away)
+    assert (done.n_clipped, unmoved.n_clipped) == (0, len(away))
 
 
 @pytest.mark.parametrize("kind", ["exact", "band"])
@@ -201,9 +203,31 @@ def test_points_that_are_none_are_refused_and_faces_may_be_arrays() -> None:
     start = sdf.query(points)
     done = Resolver(garment.faces.numpy(), len(points))(points, sdf, start)
     torch.testing.assert_close(done.vertices, Resolver(garment.faces, len(points))(points, sdf, start).vertices)
-    points[7] = math.nan
-    with pytest.raises(MeshError, match="points must be finite, got 1 of"):
-        Resolver(garment.faces, len(points))(points, sdf, start)
+    resolver, broken = Resolver(garment.faces, len(points)), points.clone()
+    broken[7] = math.nan
+    for before in (start, None):
+        resolver(points, sdf, start)
+        with pytest.raises(MeshError, match="points must be finite, got 1 of"):
+            resolver(broken, sdf, before)
+        assert torch.equal(resolver(points, sdf, start).vertices, done.vertices)
+
+
+def test_nothing_goes_on_from_a_call_that_was_interrupted() -> None:
+    """It went on from wherever that had got to."""
+    body, _, points = dressed("short-pant-male", 0.3, 0.01)
+    sdf, resolver = distance("short-pant-male", "exact"), worn("short-pant-male")[2]
+    sdf.update(body)
+    start = sdf.query(points)
+    right = resolver(points, sdf, start).vertices
+
+    def interrupted(*_: Tensor) -> Tensor:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        resolver(points, sdf, start, scale=interrupted)
+    with pytest.raises(MeshError, match="nothing to go on from"):
+        resolver(points, sdf, None)
+    assert torch.equal(resolver(points, sdf, start).vertices, right)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -34,9 +34,7 @@ def two_balls(apart: float) -> trimesh.Trimesh:
 def made(mesh: trimesh.Trimesh, **changes: float) -> WayOut:
     body = torch.tensor(mesh.vertices, dtype=torch.float32)
     skin = Sheet(Connectivity.of(mesh.faces, len(body)), body)
-    way_out = WayOut(skin, settings=replace(DEFAULT_CONTACT, **changes))
-    way_out.update()
-    return way_out
+    return WayOut(skin, settings=replace(DEFAULT_CONTACT, **changes))
 
 
 def winding(mesh: trimesh.Trimesh, points: Tensor) -> NDArray[np.float64]:
