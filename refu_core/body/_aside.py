@@ -20,7 +20,6 @@ from refu_core.body._kinematics import rotvec_to_rotmat
 from refu_core.body._model import SmplBody
 from refu_core.body._parts import ARMS, joints_of, part_of_faces
 from refu_core.body._segments import SOFTNESS, Solids, cut
-from refu_core.body._skinning import solved
 from refu_core.mesh import Connectivity, linked
 
 Array = NDArray[np.float64]
@@ -38,9 +37,6 @@ _THIN = 0.02
 are about as long, and goes out as far beyond the surface as it was inside, until it is wholly out. Of 1,152 tops on
 other studios' motion, 15 weren't free of the body without this; 8 aren't."""
 _TINY = 1e-18  # added to a square [m²]
-_DAMPING = 0.25
-"""Of the squared levers: no middle by itself then turns an arm farther than its depth over its lever, even where the
-way out is along the arm: s / (s² + 1/4) is at most 1, s being the sine of the angle between the two."""
 _FOREARMS = (joints_of("left_forearm"), joints_of("right_forearm"))
 _UPPER_ARMS = (joints_of("left_upper_arm"), joints_of("right_upper_arm"))
 
@@ -53,10 +49,10 @@ class Aside:
     middle is outside is inside by half of its thickness at most, so it is a dent. Only a thumb bores a hole narrower
     than the cloth's triangles, so it goes farther out.
 
-    Each middle that is inside asks its arm to turn until it is at the surface, or both arms if it is inside the other
-    one. They turn as asked in the sense of least squares, in which deep middles count most. So arms move continuously,
-    and where no middle is inside, nothing moves. The exception is an arm that is half-way through the trunk, a thigh or
-    the other arm: there the nearest way out changes sides, and the arm leaps.
+    Each middle that is inside asks for the least turn that brings it to the surface, of both arms if it is inside the
+    other one; deep ones count most. So arms move continuously, and where no middle is inside, nothing moves. The
+    exception is an arm that is half-way through the trunk, a thigh or the other arm: there the nearest way out changes
+    sides, and the arm leaps.
     """
 
     def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:
@@ -126,10 +122,11 @@ class Aside:
         return skin, rotation
 
     def _step(self, points: Tensor, pivots: Tensor, arm: Tensor, turn: Tensor) -> Tensor:
-        """How much farther each arm has to turn [rad], shape (2, 3): a damped Gauss-Newton step.
+        """How much farther each arm has to turn [rad], shape (2, 3): a Newton step.
 
-        A middle at the lever r from its shoulder that is inside by d asks for turn · (r × n) = d, n being the way out.
-        Two arms that are inside each other share d in proportion to their squared levers. Equations count by d².
+        A middle with the lever r from its shoulder and the way out w asks for the least turn that takes it there,
+        r × w / r². Inside the other arm it asks both, for r × w / (r² + s²) and -s × w / (r² + s²), where s is its
+        lever from the other shoulder. An arm turns by the mean of what is asked of it, weighted by w².
 
         Args:
             points: The skin and the caps before any arm turned [m].
@@ -145,18 +142,15 @@ class Aside:
         seen = other + (from_other[:, None] @ by_other)[:, 0]
         of_body, of_arm = self._way_out(points, torch.cat((pivots[of] + at, seen))).view(2, -1, 3)
         of_arm = (by_other @ of_arm[..., None])[..., 0]
-        # Three equations of each middle: its arm and the body; its arm and the other one; that one and its arm.
         lever, way = torch.stack((at, at, from_other)), torch.stack((of_body, of_arm, -of_arm))
+        lever2, way2 = lever.square().sum(2, keepdim=True), way.square().sum(2, keepdim=True)
+        both2 = lever2 + torch.stack((torch.zeros_like(lever2[0]), lever2[2], lever2[1]))
+        asked = torch.linalg.cross(lever, way) / both2
         is_of = self._is_of.to(arm)
-        whose = torch.stack((is_of, is_of, is_of.flip(0)), 1)
-        lever2, depth2 = (lever * lever).sum(2), (way * way).sum(2)
-        share = torch.cat((torch.ones_like(lever2[:1]), lever2[1:] / lever2[1:].sum(0)))
-        row = torch.linalg.cross(lever, way)  # d (r × n)
-        damping = _DAMPING * torch.einsum("akc,kc->a", whose, lever2 * depth2)
-        scale = torch.where(damping > 0, damping, 1.0)[:, None]
-        matrix = torch.einsum("akc,kci,kcj->aij", whose, row, row) / scale[..., None]
-        asked = torch.einsum("akc,kc,kci->ai", whose, share * depth2, row) / scale
-        return solved(matrix + torch.eye(3).to(matrix), asked)
+        whose = torch.cat((is_of, is_of, is_of.flip(0)), 1)
+        total = whose @ way2.flatten(0, 1)
+        step: Tensor = whose @ (way2 * asked).flatten(0, 1) / torch.where(total > 0, total, 1.0)
+        return step
 
     def _means(self, skin: Tensor) -> Tensor:
         return embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=self._weight.to(skin))

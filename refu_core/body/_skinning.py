@@ -87,17 +87,10 @@ def unapply_transforms(points: Tensor, transforms: RigidTransforms) -> Tensor:
     Exact up to rounding. Where a blend has collapsed (joint rotations almost half a turn apart) the determinant is
     bounded away from zero, so that the result stays finite.
     """
-    return solved(transforms.rotation, points - transforms.translation)
-
-
-def solved(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """The solutions (..., 3) of 3 × 3 systems with `matrices` (..., 3, 3) and right sides (..., 3), by Cramer's rule.
-
-    Determinants are bounded away from zero. A CUDA graph can capture it, and it is differentiable.
-    """
-    a, b, c = matrices.unbind(-1)  # columns
+    moved = points - transforms.translation
+    a, b, c = transforms.rotation.unbind(-1)  # columns
     bc, ca, ab = torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)
     det = (a * bc).sum(-1)
     det = torch.where(det.abs() < _MIN_DETERMINANT, torch.where(det < 0, -_MIN_DETERMINANT, _MIN_DETERMINANT), det)
-    by_columns = torch.stack(((bc * vectors).sum(-1), (ca * vectors).sum(-1), (ab * vectors).sum(-1)), -1)
-    return by_columns / det.unsqueeze(-1)
+    solved = torch.stack(((bc * moved).sum(-1), (ca * moved).sum(-1), (ab * moved).sum(-1)), -1)  # Cramer's rule
+    return solved / det.unsqueeze(-1)

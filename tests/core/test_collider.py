@@ -230,7 +230,7 @@ def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Coll
 _HUG = (0, -1.47, 0.29), (0, 1.62, 0.42), (0, -2.0, 0), (0, 1.1, 0)
 
 
-def test_arms_turn_by_damped_least_squares(body: SmplBody, collider: Collider) -> None:
+def test_arms_turn_as_their_middles_ask(body: SmplBody, collider: Collider) -> None:
     """Against the definition, middle by middle: of arms in each other and in the chest."""
     turns = dict(zip(INSIDE["forearms in each other"], _HUG, strict=True))
     points, middles = _asked(collider, body(pose=posed(body, turns)).vertices[0])
@@ -238,26 +238,18 @@ def test_arms_turn_by_damped_least_squares(body: SmplBody, collider: Collider) -
     pivots = aside._means(points[: len(body.v_template)])[: len(ARMS)]
     step = aside._step(points, pivots, middles[:n] - pivots[aside._arm], torch.zeros(2, 3))
 
-    ways = aside._way_out(points, middles).double().numpy()
+    ways, places, shoulders = (one.double().numpy() for one in (aside._way_out(points, middles), middles, pivots))
     assert ways[:n].any()
     assert ways[n:].any()
-    place, pivot, arm_of = middles.double().numpy(), pivots.double().numpy(), aside._arm.tolist()
-    matrix, right, squares = np.zeros((2, 3, 3)), np.zeros((2, 3)), np.zeros(2)
-    for row, way in enumerate(ways):
-        depth = np.linalg.norm(way)
-        if not depth:
-            continue
-        own, is_of_arm = arm_of[row % n], row >= n
-        lever = [place[row] - pivot[arm] for arm in (own, 1 - own)]
-        square = [one @ one for one in lever]
-        asked = [square[k] / sum(square) if is_of_arm else 1.0 for k in range(2)]
-        for k, arm in enumerate((own, 1 - own) if is_of_arm else (own,)):
-            along = np.cross(lever[k], way / depth) * (-1) ** k
-            matrix[arm] += depth**2 * np.outer(along, along)
-            right[arm] += depth**2 * asked[k] * depth * along
-            squares[arm] += depth**2 * square[k]
-    wanted = [np.linalg.solve(matrix[arm] + 0.25 * squares[arm] * np.eye(3), right[arm]) for arm in range(2)]
-    np.testing.assert_allclose(step.numpy(), np.array(wanted), atol=1e-5, rtol=1e-3)
+    asked, total = np.zeros((2, 3)), np.zeros((2, 1))
+    for row, (place, way) in enumerate(zip(places, ways, strict=True)):
+        own = int(aside._arm[row % n])
+        moves = {own: way} if row < n else {own: way, 1 - own: -way}
+        squares = sum(np.sum((place - shoulders[arm]) ** 2) for arm in moves)
+        for arm, to in moves.items():
+            asked[arm] += way @ way * np.cross(place - shoulders[arm], to) / squares
+            total[arm] += way @ way
+    np.testing.assert_allclose(step.numpy(), asked / total, atol=1e-6, rtol=1e-4)
 
 
 def test_a_thumb_goes_out_as_far_as_it_was_inside(body: SmplBody, collider: Collider) -> None:
