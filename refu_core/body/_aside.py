@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from refu_core._cache import remembered
-from refu_core._warp import Recorded, Repeated, as_warp, ints, is_plain, memory, refit
+from refu_core._warp import Recorded, Repeated, as_warp, ints, is_plain, memory, readable, refit
 from refu_core.body import _aside_kernels as kernels
 from refu_core.body._collider_gradient import weights_at, within
 from refu_core.body._collider_kernels import Means
@@ -89,11 +89,16 @@ class Aside:
         trees = wp.array([one.id for one in self._trees], dtype=wp.uint64, device=str(device))
         first_face = ints(np.cumsum([0, *map(len, solids.faces)]), device)
         box = [as_warp(corner, wp.vec3) for corner in self._box]
-        self._find = Repeated(kernels.inside_kernel, (wp.int32, wp.vec3, wp.int32, wp.vec3), [trees, first_face, *box])
+        known = [trees, first_face, *box]
+        self._find = Repeated(kernels.inside_kernel, (wp.int32, wp.vec3, wp.int32, wp.vec3), known)
         self._asked = torch.cat((torch.zeros_like(self._arm), len(ARMS) - self._arm)).int()
         """The solids that middles are looked for in: the body, and then the other arm, shape (2 C,)."""
         if self._is_serial:
-            self._look = self._recorded_look(solids, weights, box)
+            self._look, places = self._recorded_look(solids, weights, box)
+            self._looks = [
+                self._recorded_find(known, asked, places, fitted)
+                for asked, fitted in zip(self._asked.chunk(2), (self._trees[:1], self._trees[1:]), strict=True)
+            ]
 
     def __call__(self, skin: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
         """One body's skin (V, 3) [m] and the joints' `rotation` (24, 3, 3), both with the arms moved aside.
@@ -155,8 +160,8 @@ class Aside:
     def _means(self, skin: Tensor) -> Tensor:
         return embedding_bag(self._vertex, skin, self._start, mode="sum", per_sample_weights=self._weight.to(skin))
 
-    def _recorded_look(self, solids: Solids, weights: Array, box: list[Any]) -> Any:
-        """A launch that finds boxes, caps and middles (`_places`), and counts middles near each solid (`_n_near`)."""
+    def _recorded_look(self, solids: Solids, weights: Array, box: list[Any]) -> tuple[Recorded, Tensor]:
+        """A launch that finds boxes, caps and middles (C, 3), and counts middles near each solid (`_n_near`)."""
         corners, solid = [], []
         for s, faces in enumerate(solids.faces):
             own = faces[(faces < len(weights)).all(1)]
@@ -170,12 +175,21 @@ class Aside:
         means.start, means.vertex = ints(start, "cpu"), ints(self._vertex, "cpu")
         segments = (np.cumsum([0, *map(len, corners)]), np.concatenate(corners), solid)
         means.weight = wp.array(self._weight.numpy(), dtype=wp.float32, device="cpu")
-        places, near = memory(len(start) - 1, 3), memory(len(self._trees), dtype=torch.int32)
-        self._places, self._n_near = places[:n_middles], near
+        places, n_near = memory(len(start) - 1, 3), memory(len(self._trees), dtype=torch.int32)
+        self._n_near = readable(n_near)
         means.mean = as_warp(places, wp.vec3)
         arguments = [as_warp(self._points, wp.vec3), len(weights), ints(self._arm, "cpu"), means]
-        arguments += [*(ints(one, "cpu") for one in segments), *box, as_warp(self._n_near, wp.int32)]
-        return Recorded(kernels.near_kernel, 1, arguments, "cpu")
+        arguments += [*(ints(one, "cpu") for one in segments), *box, as_warp(n_near, wp.int32)]
+        return Recorded(kernels.near_kernel, 1, arguments, "cpu"), places[:n_middles]
+
+    def _recorded_find(
+        self, known: list[Any], asked: Tensor, places: Tensor, trees: list[Any]
+    ) -> tuple[list[Any], Recorded, NDArray[Any]]:
+        """Trees, a launch that looks for the middles at `places` (C, 3) in these, and the faces that it finds."""
+        face, weights = memory(len(places), dtype=torch.int32), memory(len(places), 3)
+        found = [as_warp(one, kind) for one, kind in ((asked, wp.int32), (places, wp.vec3), (face, wp.int32))]
+        launch = Recorded(kernels.inside_kernel, len(places), [*known, *found, as_warp(weights, wp.vec3)], "cpu")
+        return trees, launch, readable(face)
 
     def _is_any_inside(self, skin: Tensor) -> bool:
         """Whether any middle is inside the body or the other arm. A tree is asked only if one is near its solid.
@@ -184,21 +198,23 @@ class Aside:
         """
         self._points[: len(skin)].copy_(skin.detach())
         self._look.launch()
-        of_body, *of_arms = self._n_near.tolist()
-        if not of_body and not any(of_arms):
-            return False
-        n_trees, n_sides = (len(self._trees), 2) if any(of_arms) else (1, 1)
-        refit(self._trees[:n_trees], self._device)
-        if not (self._inside(self._places.repeat(n_sides, 1))[0] >= 0).any():
-            return False
-        refit(self._trees[n_trees:], self._device)
-        return True
+        is_near = (bool(self._n_near[0]), bool(self._n_near[1:].any()))
+        found = False
+        for (trees, look, faces), is_asked in zip(self._looks, is_near, strict=True):
+            if is_asked:
+                refit(trees, self._device)
+                look.launch()
+                found |= bool(faces.max() >= 0)
+        for (trees, *_), is_fitted in zip(self._looks, is_near, strict=True):
+            if found and not is_fitted:
+                refit(trees, self._device)
+        return found
 
     def _inside(self, at: Tensor) -> tuple[Tensor, Tensor]:
-        """The solids' closest faces to the middles at (C, 3) or (2 C, 3) [m], -1 outside, and corners' weights."""
+        """The solids' closest faces to the middles at (2 C, 3) [m], -1 outside, and the weights of their corners."""
         at = at.detach().float().contiguous()
         face, weights = torch.empty(len(at), dtype=torch.int32, device=self._device), torch.zeros_like(at)
-        self._find((len(at),), self._asked[: len(at)], at, face, weights)
+        self._find((len(at),), self._asked, at, face, weights)
         return face, weights
 
     def _way_out(self, points: Tensor, at: Tensor) -> Tensor:
