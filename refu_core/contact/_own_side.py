@@ -28,6 +28,7 @@ class OwnSide:
         forearms = joints_of("left_forearm", "right_forearm")
         is_sleeve = weight_of_parts(garment.weights, [forearms])[:, 0] > 0.5
         self._reach = torch.where(is_sleeve, thickness / 4, torch.inf).clamp(max=settings.layer_reach)
+        self._deep = -self._reach
         ring = garment.mesh.ring
         self._start, self._ring = (
             torch.as_tensor(one).long().to(thickness.device) for one in (ring.start[:-1], ring.items)
@@ -35,7 +36,7 @@ class OwnSide:
 
     def is_any_deep(self, distance: Tensor) -> bool:
         """Whether any vertex goes any part of its way, for their signed distances [m], shape (V,)."""
-        return float((distance + self._reach).min()) < 0
+        return bool((distance < self._deep).any())
 
     def share(self, distance: Tensor) -> Tensor:
         """How much of its way each vertex goes, for its signed distance [m]; both of shape (V,).
