@@ -1,6 +1,6 @@
 """Contact on a mesh of your own: a tube of cloth, without skinning weights or networks, is moved off a body.
 
-python examples/own_mesh.py [GARMENT.obj]
+python examples/own_mesh.py [GARMENT.obj]  # in metres, where the body is: T-pose, y up, the chest at the origin
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def tube(radius: float, low: float, high: float) -> trimesh.Trimesh:
 def main(path: str | None = None) -> tuple[int, int]:
     """Returns how many pairs of triangles of garment and body intersect, before and after."""
     body = load_body("male")
-    skin = body(torch.zeros(1, 24, 3)).vertices[0]  # T-pose, SMPL axes: y up, the chest at the origin
+    skin = body(torch.zeros(1, 24, 3)).vertices[0]  # T-pose, SMPL axes
     garment = tube(0.14, -0.35, -0.05) if path is None else read_surface(path)
     vertices = torch.tensor(garment.vertices, dtype=torch.float32)
     faces = torch.tensor(garment.faces)
@@ -40,12 +40,14 @@ def main(path: str | None = None) -> tuple[int, int]:
     sdf = ExactSdf(body.faces)
     sdf.update(skin)
     resolver = Resolver(faces, len(vertices))  # once per garment
-    done = resolver(vertices, sdf, sdf.query(vertices), margin=0.004)  # every frame
+    sample = sdf.query(vertices)
+    done = resolver(vertices, sdf, sample, margin=0.004)  # every frame
 
     checker = CollisionChecker(body.faces)
     checker.update(skin)
     before, after = (checker.check(mesh, faces).n_pairs for mesh in (vertices, done.vertices))
-    print(f"{done.n_inside} of {len(vertices)} vertices were inside, the deepest {1e3 * done.max_depth:.0f} mm")
+    low, high = (1e3 * sample.distance).aminmax()
+    print(f"{done.n_inside} of {len(vertices)} vertices were inside; all were {low:.0f} to {high:.0f} mm off the skin")
     print(f"intersecting pairs of triangles: {before} before, {after} after")
     return before, after
 

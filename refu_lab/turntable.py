@@ -26,8 +26,8 @@ from refu_lab.render import COLLIDING, RenderMesh, sky_light
 STYLE = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
 _GRID = (1 << 14) - 1
 """Grid steps along the longest side of a frame's bounding box."""
-_MOST = 1 << 15
-"""Most vertices of a mesh: differences of vertex indices have to fit 16 bits, sign included."""
+_MOST = (1 << 16) - 1
+"""Most vertices of a mesh: an index has 16 bits, and the last number ends a strip of triangles in WebGL."""
 _SCRIPT = Path(__file__).with_suffix(".js")
 
 
@@ -108,6 +108,7 @@ def _quantised(meshes: Sequence[RenderMesh], low: NDArray[np.float32], step: flo
 
 
 def _signed(numbers: NDArray[np.int64]) -> bytes:
-    """Numbers in ±32,767, signs in the lowest bit so that small ones stay small: all low bytes, then all high bytes."""
-    folded = np.where(numbers < 0, -2 * numbers - 1, 2 * numbers).astype(np.uint16).reshape(-1)
+    """Numbers modulo 65,536, signs in the lowest bit so that small ones stay small: low bytes, then high bytes."""
+    near = numbers.astype(np.int16).reshape(-1)
+    folded = ((near << 1) ^ (near >> 15)).view(np.uint16)
     return (folded & 0xFF).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()

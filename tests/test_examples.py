@@ -66,6 +66,9 @@ def test_own_mesh_from_a_file(run, tmp_path: Path) -> None:
     before, after = numbers(r": (\d+) before, (\d+) after", run("own_mesh", "mine.obj"))
     assert before > 0
     assert after == 0
+    trimesh.Trimesh(100 * mesh.vertices, mesh.faces, process=False).export(tmp_path / "centimetres.obj")
+    _, high = numbers(r"all were (-?\d+) to (\d+) mm off the skin", run("own_mesh", "centimetres.obj"))
+    assert high > 10_000  # else nobody sees why nothing was inside
     with pytest.raises(SystemExit, match=r"own_mesh.py: gone.obj: can't be read: No such file"):
         run("own_mesh", "gone.obj")
 

@@ -180,8 +180,8 @@ def _require_worn(mesh: SurfaceMesh) -> None:
     """Raises `GarmentError` for a mesh that is laid out flat, or that is in shreds."""
     n_pieces, _ = components(mesh.faces, len(mesh.vertices))
     if n_pieces > _MOST_PIECES:
-        msg = f"it is in {n_pieces} pieces, at most {_MOST_PIECES} are worn: merge the vertices that lie on each other"
-        raise GarmentError(msg)
+        advice = "merge the vertices that nearly lie on each other, or leave out what is tiny, as sequins are"
+        raise GarmentError(f"it is in {n_pieces} pieces, at most {_MOST_PIECES} are worn: {advice}")
     normals = face_normals(mesh.vertices, mesh.faces)
     area = np.linalg.norm(normals, axis=1)
     share, axes = np.linalg.eigh(normals.T @ (normals / np.maximum(area, 1e-300)[:, None]))

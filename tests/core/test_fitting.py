@@ -377,7 +377,8 @@ def test_shreds_are_refused_before_they_take_minutes() -> None:
     apart = v[f].reshape(-1, 3) + np.random.default_rng(0).normal(0, 1e-4, (f.size, 3))
     shreds = SurfaceMesh(apart, np.arange(f.size).reshape(-1, 3))
     begun = time.process_time()
-    with pytest.raises(GarmentError, match=r"it is in \d+ pieces, at most 1000 are worn: merge the vertices"):
+    said = r"it is in \d+ pieces, at most 1000 are worn: merge the vertices .*, or leave out what is tiny"
+    with pytest.raises(GarmentError, match=said):
         fit_garment(shreds, load_body("neutral"), name="shreds")
     assert time.process_time() - begun < 10
 
