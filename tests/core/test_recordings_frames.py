@@ -74,6 +74,12 @@ def test_one_dictionary_per_person_and_frame(whole: Callable[[int], Any], name: 
         np.testing.assert_allclose(motion.transl[kept], TRANSL[kept] + [x, 0, 0])
 
 
+def test_a_list_too_long_to_read_says_how_to_save_it(tmp_path: Path) -> None:
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps([person(0)] + [{"frame": i} for i in range(300_000)]))
+    with pytest.raises(MotionFileError, match="too many values: save one array for all frames"):
+        read_motion(tmp_path / "a.pkl", fps=30)
+
+
 ODD_ROWS: dict[str, dict[str, Any]] = {
     "an infinite number of a person": romp(0) | {"track_ids": np.array([np.inf, 1.0])},
     "the same beside bodies": {"smpl": [person(0)], "tid": np.array([np.inf])},
