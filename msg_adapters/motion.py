@@ -121,7 +121,7 @@ def load_motion(path: str, *, axes: Axes = "auto", fps: float = 0.0) -> Motion:
     track = Track()
     for frame in frames:
         track.add(frame)
-    notes += track.doubts(is_y_up=axes != "frame").values()
+    notes += track.doubts(up=None if axes == "frame" else np.array([0.0, 1.0, 0.0])).values()
     if any((frame.betas != frames[0].betas).any() for frame in frames):
         notes.append("betas differ between frames: a person has one shape, the first frame's")
     poses, transl = (np.stack(arrays) for arrays in zip(*((f.pose, f.transl) for f in frames), strict=True))

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_adapters.cdr import NS_PER_S, Buffer, CdrReader
 from msg_adapters.errors import DecodeError
@@ -20,6 +21,8 @@ from refu_core.recordings import FASTEST, LONGEST_TURN, axis_of, upright_share
 
 if TYPE_CHECKING:
     from refu_core.body import SmplBody
+
+Array = NDArray[np.float64]
 
 MAX_STAMP_NS = 2**31 * NS_PER_S
 """From here on a stamp doesn't fit a message."""
@@ -138,11 +141,11 @@ class Track:
         longest = float(np.linalg.norm(frame.pose, axis=1).max())
         self._rows.extend((longest, 1e-9 * frame.stamp_ns, *frame.pose[0], *frame.transl))
 
-    def doubts(self, *, is_y_up: bool) -> dict[str, str]:
+    def doubts(self, *, up: Array | None) -> dict[str, str]:
         """What is doubtful in most frames: a sentence for each that is.
 
-        Of `angles`, `pace`, `stamps`, `receipt` (leaps in any frame) and `axes`. `is_y_up`: the frames are said to be
-        in SMPL's axes.
+        Of `angles`, `pace`, `stamps`, `receipt` (leaps in any frame) and `axes`. `up` is said to be up for the
+        sender, shape (3,); y in SMPL's axes. None: nothing is said of it.
         """
         rows = np.frombuffer(self._rows).reshape(-1, _NUMBERS)
         if not len(rows):
@@ -164,15 +167,19 @@ class Track:
         if self._n_leaps:
             times = f"times of receipt leap in {self._n_leaps} of {len(rows)} frames, at first by {self._leap_s:+.1f} s"
             found["receipt"] = f"{times}, and stamps don't: did the recorder's clock? A bag that is written keeps them"
-        share, axis = upright_share(rows[:, 2:5]), axis_of(rows[:, 2:5])
-        if is_y_up and share < 0.5:
-            along = f", heads are towards {axis}" if axis else ""
-            text = f"people are upright in {100 * share:.0f} % of {len(rows)} frames{along}: input_axes is smpl (y up)"
-            found["axes"] = f"{text}. Where it isn't, set it to frame"
+        roots = rows[:, 2:5]
+        if up is not None and (share := upright_share(roots, up)) < 0.5:
+            along = f", heads are towards {axis}" if (axis := axis_of(roots)) else ""
+            said = _OF_SMPL if up[1] > 0 else _OF_FRAME.format("z" if up[2] > 0 else "-y")
+            found["axes"] = f"people are upright in {100 * share:.0f} % of {len(rows)} frames{along}: {said}"
         return found
 
 
 _BACK = "two senders on one topic, a clock set back, or parts out of order? Frames are taken as they were recorded"
+_OF_SMPL = "input_axes is smpl (y up). Where it isn't, set it to frame"
+_OF_FRAME = (
+    "input_axes is frame, and frame_id has {} up (-y with optical in its name, else z). Where it hasn't, change one"
+)
 _NUMBERS = 8
 _SHORTEST_S, _LONGEST_S = 1e-3, 5.0
 """The shortest and longest plausible step between frames whose stamps are in nanoseconds [s]."""
@@ -191,8 +198,8 @@ class Doubts:
         self._tracks: dict[str, Track] = {}
         self._said: set[str] = set()
 
-    def of(self, sender: str, frame: SmplFrame, options: DressOptions, *, is_y_up: bool) -> list[str]:
-        """New warnings about a sender's frame of parameters; `is_y_up`: it is said to be in SMPL's axes."""
+    def of(self, sender: str, frame: SmplFrame, options: DressOptions, *, up: Array | None) -> list[str]:
+        """New warnings about a sender's frame of parameters; `up` is as in `Track.doubts`."""
         found = {}
         if not options.betas_are_told and frame.betas.any():
             self.has_foreign_betas = True
@@ -202,7 +209,7 @@ class Doubts:
         track = self._tracks.setdefault(sender, Track())
         track.add(frame)
         if len(track) >= _LOOKED_AT:
-            doubts = self._tracks.pop(sender).doubts(is_y_up=is_y_up)
+            doubts = self._tracks.pop(sender).doubts(up=up)
             self.of_senders[sender] = "; ".join(text for kind, text in doubts.items() if kind != "axes")
             found |= doubts
         new = [text for kind, text in found.items() if kind not in self._said]

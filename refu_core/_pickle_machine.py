@@ -127,7 +127,7 @@ class Unpickler(pickle._Unpickler):
     def _read_counted(self, n: int) -> bytes:
         self._left -= 1
         if self._left < 0:
-            raise ValueError("too many opcodes and values")
+            raise ValueError("too many values: save one array for all frames, as in an .npz, or fewer frames")
         return self._read_uncounted(n)
 
     def find_class(self, module: str, name: str) -> Name:

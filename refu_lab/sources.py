@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import msg_adapters as adapters
 from msg_adapters import FrameRecord
-from msg_adapters.axes import WORLD_FRAME, up_of
+from msg_adapters.axes import WORLD_FRAME, up_of, up_of_sender
 from msg_adapters.inputs import body_of
 from refu_core import FrameError, RefuError, SmplFrame
 from refu_core.errors import printable
@@ -97,7 +97,7 @@ class Source:
             *body_warnings(pipeline, gender=self.gender),
             *self.notes,
             *(() if bag is None else bag.reader.warnings),
-            *self.track.doubts(is_y_up=options.axes == "smpl").values(),
+            *self.track.doubts(up=up_of_sender(options.axes, options.frame_id or self.frame_id, np.eye(3))).values(),
             *([FOREIGN_BETAS] if self.has_betas and not is_told else []),
             *([ONE_STYLE.format(", ".join(plain))] if self.has_style and plain else []),
         ]
@@ -144,8 +144,11 @@ def open_source(options: RecordingOptions, pipeline: GarmentPipeline | None = No
         decode = _follower(options, load().body, notes)
     else:
         input_type = bag.decoder.input_type
-        is_smpl = options.axes == "smpl"
-        decode = _decoding(bag.decoder, lambda data: None if is_smpl else up_of(adapters.frame_id_of(data, input_type)))
+
+        def up_in(data: bytes) -> NDArray[np.float64] | None:
+            return None if options.axes == "smpl" else up_of(options.frame_id or adapters.frame_id_of(data, input_type))
+
+        decode = _decoding(bag.decoder, up_in)
     frame_id = given if given and (is_placed or options.axes == "frame") else WORLD_FRAME
     read = printable(f"{topic} ({kind})"), topic, kind, decode, iter(bag), bag.message_count
     return Source(options, load(), *read, bag, notes, frame_id=frame_id)
@@ -216,7 +219,7 @@ def _follower(options: RecordingOptions, body: SmplBody, notes: list[str]) -> Ca
             others.update(dict.fromkeys(sorted(new)))
             listing = ", ".join([*others][:_SHOWN]) + (" …" if len(others) > _SHOWN else "")
             notes[:] = [f"{1 + len(others)} persons: {followed} is taken; also {listing} (--person chooses another)"]
-        return replace(people[followed], up=up_of(frame_ids[followed]))
+        return replace(people[followed], up=up_of(options.frame_id or frame_ids[followed]))
 
     return decode
 

@@ -94,7 +94,7 @@ def _input(report: Report, settings: NodeSettings, now: Situation) -> Judgement:
     rules: list[tuple[object, int, str]] = [
         (now.state != "active", OK, "not active"),
         (now.listening_for is None, OK, "not subscribed to: nobody listens to anything, and nothing is recorded"),
-        (invalid and invalid == received, ERROR, f"every message is invalid: {reasons['invalid']}"),
+        (invalid and invalid >= received, ERROR, f"every message is invalid: {reasons['invalid']}"),
         (invalid, WARN, f"{invalid} of {received} messages are invalid: {reasons['invalid']}"),
         (n := recent["drop.stale_transforms"], WARN, f"{n} messages of transforms weren't read: too many come"),
         (n := recent["drop.transform"], WARN, f"{n} of {received} have no transform: {reasons['transform']}"),

@@ -232,9 +232,11 @@ class Listener:
             self._refuse(topic, error)
             return
         given = {name: printable(frame_id.lstrip("/")) for name, frame_id in frame_ids.items()}
+        axes, target = self._settings.axes, self._settings.frame_id
         # Keypoints' betas are measured on the body that is dressed, and their axes are those of `frame_id`.
-        for frame in () if self.stream.is_of_keypoints else frames.values():
-            for doubt in self.doubts.of(person, frame, self._settings, is_y_up=self._settings.axes == "smpl"):
+        for name, frame in () if self.stream.is_of_keypoints else frames.items():
+            up = up_of_sender(axes, target, np.eye(3)) if axes == "smpl" or given[name] in ("", target) else None
+            for doubt in self.doubts.of(person, frame, self._settings, up=up):  # None: a transform will tell
                 node.get_logger().warning(f"{topic}: {doubt}")
         for frame_id in given.values():
             self._need_transforms(topic, frame_id)

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from refu_core.garments import BUILTIN_GARMENTS, load_garment
+from refu_core.recordings._upright import PELVIS, PELVIS_OF_SMPLX
 from refu_core.skeleton import JOINT_NAMES
 from refu_core.weights import weights_folder
 
@@ -127,6 +128,12 @@ def test_the_node_s_page_names_the_joints_in_their_order() -> None:
         r"^The joints, in SMPL's order, are (.*?)\. So", (DOCS / "guide/ros.md").read_text(), re.S | re.M
     )
     assert tuple(re.findall(r"`(\w+)`", listed)) == JOINT_NAMES
+
+
+def test_the_node_s_page_moves_smplx_as_files_are_moved() -> None:
+    text = (DOCS / "guide" / "ros.md").read_text(encoding="utf-8")
+    shift = ", ".join(f"{number:.3f}" for number in PELVIS_OF_SMPLX - PELVIS)
+    assert f"add ({shift}) m to its translation" in text
 
 
 def test_the_garments_page_says_what_ships() -> None:

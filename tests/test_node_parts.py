@@ -37,6 +37,7 @@ from msg_adapters import (
     check_plausible,
     decode_marker_array,
 )
+from msg_adapters.axes import up_of_sender
 from msg_adapters.bags import Recorder, RecorderState, RunningRecording, free_path, path_in
 from msg_adapters.cdr import CdrReader, CdrWriter
 from msg_adapters.outputs._topics import is_due
@@ -58,6 +59,7 @@ from tests.virtual_time import VirtualTime
 TOPIC, TYPE = "/garments", "visualization_msgs/msg/MarkerArray"
 KEYPOINT_POSES = "geometry_msgs/msg/PoseArray"
 GARMENT = "short-pant-male"
+Y = np.array([0.0, 1.0, 0.0])
 
 
 def frame(angle: float = 0.0, *, stamp_ns: int = 1, transl: tuple[float, ...] = (0.0, 0.0, 0.0)) -> SmplFrame:
@@ -923,6 +925,19 @@ def test_a_clock_that_never_came_and_doubted_input_are_warned_of() -> None:
     assert found["n: input"].message == "degrees?"
 
 
+def test_a_message_that_came_before_the_report_and_was_refused_after_it_makes_sense() -> None:
+    statistics = Statistics()
+    statistics.receive()
+    report_of(statistics)
+    statistics.drop("invalid", "it is damaged")
+    status = report_of(statistics)["input"]
+    assert (status.level, status.message) == (2, "every message is invalid: it is damaged")
+    statistics.receive()
+    statistics.receive()
+    statistics.drop("invalid", "it is damaged")
+    assert report_of(statistics)["input"].message == "1 of 2 messages are invalid: it is damaged"
+
+
 def test_betas_of_unknown_meaning_are_warned_of() -> None:
     statistics = Statistics()
     statistics.receive()
@@ -939,12 +954,36 @@ def test_people_who_lie_are_warned_of_once(root: tuple[float, ...], words: str) 
     settings, doubts = NodeSettings(), Doubts()
     pose = np.zeros((24, 3), np.float32)
     pose[0] = root
-    said = [doubt for _ in range(300) for doubt in doubts.of("", SmplFrame(pose), settings, is_y_up=True)]
+    said = [doubt for _ in range(300) for doubt in doubts.of("", SmplFrame(pose), settings, up=Y)]
     assert len(said) == bool(words) + 1  # who has no stamps is told, too
     assert words in "".join(said)
-    of_frame = Doubts()
     frames = [SmplFrame(pose, stamp_ns=i * 10**8) for i in range(300)]
-    assert not any(of_frame.of("", frame, settings, is_y_up=False) for frame in frames)
+    of_frame = Doubts()  # which way is up isn't known
+    assert not any(of_frame.of("", frame, settings, up=None) for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("frame_id", "root", "words"),
+    [
+        ("map", [np.pi, 0, 0], "towards -y: input_axes is frame, and frame_id has z up"),
+        ("camera", [np.pi, 0, 0], "towards -y: input_axes is frame, and frame_id has z up"),
+        ("camera_optical", [0, 0, 0], "towards +y: input_axes is frame, and frame_id has -y up"),
+        ("camera_optical", [np.pi, 0, 0], ""),
+        ("map", [np.pi / 2, 0, 0], ""),
+    ],
+)
+def test_people_whose_heads_arent_where_their_frame_has_up_are_warned_of(
+    frame_id: str, root: list[float], words: str
+) -> None:
+    """Cloth would hang sideways."""
+    doubts, pose = Doubts(), np.zeros((24, 3))
+    pose[0] = root
+    up = up_of_sender("frame", frame_id, np.eye(3))
+    said = [
+        doubt for i in range(200) for doubt in doubts.of("", SmplFrame(pose, stamp_ns=i * 10**8), NodeSettings(), up=up)
+    ]
+    assert len(said) == bool(words)
+    assert words in "".join(said)
 
 
 @pytest.mark.parametrize(
@@ -964,7 +1003,7 @@ def test_numbers_in_other_units_are_doubted(changed: Callable[[int], Any], words
     said = []
     for i in range(250):
         frame = SmplFrame(**{"pose": np.zeros((24, 3)), "stamp_ns": 10**18 + i * 10**8 // 3} | changed(i))
-        said += doubts.of("ann", frame, NodeSettings(), is_y_up=True)
+        said += doubts.of("ann", frame, NodeSettings(), up=Y)
     assert len(said) == 1
     assert words in said[0]
     assert doubts.of_senders["ann"] == said[0]
@@ -976,9 +1015,9 @@ def test_numbers_in_other_units_are_doubted(changed: Callable[[int], Any], words
 def test_a_style_that_a_garment_has_no_ear_for_is_told_once() -> None:
     styled = SmplFrame(np.zeros((24, 3), np.float32), style=np.ones(4))
     doubts, settings = Doubts(), NodeSettings().changed({"garments": ["tshirt-female", "skirt-female"]})
-    said = [doubts.of("", styled, settings, is_y_up=True) for _ in range(2)]
+    said = [doubts.of("", styled, settings, up=Y) for _ in range(2)]
     assert said == [[ONE_STYLE.format("tshirt-female")], []]
-    assert Doubts().of("", styled, NodeSettings(), is_y_up=True) == []
+    assert Doubts().of("", styled, NodeSettings(), up=Y) == []
 
 
 @pytest.mark.parametrize("collider", [True, False])

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from msg_adapters.axes import WORLD_FRAME
 from msg_adapters.cdr import Buffer, CdrReader, CdrWriter
 from msg_adapters.errors import DecodeError, decoding
-from refu_core.frames import N_BETAS, N_JOINTS, N_STYLES, SmplFrame
+from refu_core.frames import SmplFrame
 
 MESSAGE_TYPE = "std_msgs/msg/Float32MultiArray"
-_SIZES = {"pose": N_JOINTS * 3, "betas": N_BETAS, "transl": 3, "style": N_STYLES}
+_LABELS = ("pose", "betas", "transl", "style")
 _LABELLING = "label layout.dim pose (72) and, if there, betas (10), transl (3) and style (4), in the order of the data"
 _MAX_DIMENSIONS = 16
 _MIN_DIMENSION_BYTES = 12
@@ -32,11 +32,9 @@ def _blocks(dimensions: Sequence[tuple[Any, ...]], offset: int, data: NDArray[An
     blocks: dict[str, Any] = {}
     start = end = offset
     for label, size, stride in dimensions:
-        if label not in _SIZES or label in blocks:
-            what = "label" if label not in _SIZES else "second"
+        if label not in _LABELS or label in blocks:
+            what = "label" if label not in _LABELS else "second"
             raise DecodeError(f"unexpected {what} {label!r} in layout.dim; {_LABELLING}")
-        if size != _SIZES[label]:
-            raise DecodeError(f"{label} must have {_SIZES[label]} numbers, its dimension says {size}")
         if stride and stride < size:
             raise DecodeError(f"the stride of {label} must be 0 or at least its size {size}, got {stride}")
         end = start + size

@@ -105,6 +105,19 @@ class Content:
             return None
         return array if 0 < array.ndim <= 2 and array.dtype.kind in "biufUS" else None
 
+    def single(self, value: Any) -> int | str | None:
+        """The whole number or word that a value stands for, NumPy's and torch's too; None for anything else."""
+        if value is None or isinstance(value, (int, str)):
+            return value
+        try:
+            array = self.array(value)
+        except ValueError:
+            return None
+        item: int | str | None = (
+            array.reshape(-1).tolist()[0] if array.size == 1 and array.dtype.kind in "iuU" else None
+        )
+        return item
+
     def nodes(self) -> Iterator[tuple[tuple[Key, ...], Mapping[Key, Any]]]:
         """Every mapping in the file and the path to it, from the outside inwards; a shared one comes once."""
         todo: list[tuple[tuple[Key, ...], Any]] = [((), self.root)]

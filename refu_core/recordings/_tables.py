@@ -56,6 +56,13 @@ def numbers_of(content: Content, node: Mapping[Key, Any]) -> NDArray[Any] | None
     return None
 
 
+def number_of(content: Content, row: Mapping[Key, Any]) -> int | None:
+    """The frame's number in a mapping of one person in one image: its own, or that in the image's name."""
+    numbers = [number for name in table.FRAME_NUMBERS if isinstance(number := content.single(row.get(name)), int)]
+    images = [image for name in table.IMAGES if isinstance(image := content.single(row.get(name)), str)]
+    return next(iter([*numbers, *(_image(image)[1] for image in images)]), None)
+
+
 def _people(content: Content, node: Mapping[Key, Any], n: int, notes: list[str]) -> Mapping[Key, Any] | None:
     """What a table of n rows becomes; None if all of them are one person's and in order."""
     images = _words(content, node, table.IMAGES, n)

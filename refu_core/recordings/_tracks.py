@@ -14,6 +14,7 @@ from refu_core.recordings import _layouts as table
 from refu_core.recordings._containers import MOST_DEPTH, Content, Key, entries, held_by
 from refu_core.recordings._recording import MAX_FRAMES, interpolated
 from refu_core.recordings._rotations import is_one_frame
+from refu_core.recordings._tables import number_of
 
 _SAME = 0.75
 """Anybody farther than this from where a person was last seen is somebody else [m]; the same as for trackers."""
@@ -50,7 +51,9 @@ def _people(content: Content, frames: list[list[Mapping[Key, Any]]]) -> dict[str
         raise ValueError(f"{len(frames)} frames, at most {MAX_FRAMES} are read; cut the clip")
     layout = next(_layout_of(content, bodies[0]) for bodies in frames if bodies)
     assert layout is not None
-    named = _who_is_who([(_name_of(body), _place_of(content, body, layout)) for body in bodies] for bodies in frames)
+    named = _who_is_who(
+        [(_name_of(content, body), _place_of(content, body, layout)) for body in bodies] for bodies in frames
+    )
     persons: dict[str, list[tuple[int, Mapping[Key, Any]]]] = {}
     for number, (bodies, names) in enumerate(zip(frames, named, strict=True)):
         for name, body in zip(names, bodies, strict=True):
@@ -162,7 +165,9 @@ def _place_of(content: Content, body: Mapping[Key, Any], layout: table.Layout) -
 
 def _stacked(content: Content, layout: table.Layout, seen: list[tuple[int, Mapping[Key, Any]]]) -> dict[Key, Any]:
     """One person's arrays, one row per frame; what isn't in every frame is left out."""
-    track: dict[Key, Any] = {"frame_ids": np.array([number for number, _ in seen])}
+    own = [number_of(content, body) for _, body in seen]
+    numbers = [place for place, _ in seen] if None in own else own
+    track: dict[Key, Any] = {"frame_ids": np.array(numbers)}
     track |= {key: seen[0][1][key] for key in (*table.GENDERS, *table.MODELS) if seen[0][1].get(key) is not None}
     for name in layout.arrays:
         rows = [body.get(name) for _, body in seen]
@@ -222,9 +227,9 @@ def _sequences(root: Any, is_body: Callable[[Mapping[Key, Any]], bool]) -> Itera
         level = below
 
 
-def _name_of(body: Mapping[Key, Any]) -> str:
+def _name_of(content: Content, body: Mapping[Key, Any]) -> str:
     """The name that a tracker gives somebody; empty if there is none."""
-    return next((str(body[key]) for key in table.TRACK_IDS if isinstance(body.get(key), (int, str))), "")
+    return next((str(name) for key in table.TRACK_IDS if (name := content.single(body.get(key))) is not None), "")
 
 
 def _who_is_who(frames: Iterable[Sequence[tuple[str, NDArray[np.float64]]]]) -> Iterator[list[str]]:

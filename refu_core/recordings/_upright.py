@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from refu_core.frames import MAX_ANGLE
@@ -50,10 +50,10 @@ def up_of_root(roots: Array) -> Array:
     return Rotation.from_rotvec(roots).apply([0.0, 1.0, 0.0])
 
 
-def upright_share(roots: Array) -> float:
-    """Share of frames, 0 to 1, with roots (T, 3) [rad] upright in SMPL's axes; 1 if no frame is finite."""
+def upright_share(roots: Array, up: ArrayLike = (0.0, 1.0, 0.0)) -> float:
+    """Share of frames, 0 to 1, with roots (T, 3) [rad] upright in axes where `up` (3,) is; 1 if no frame is finite."""
     roots = roots[_are_sound(roots)]
-    return float((up_of_root(roots)[:, 1] > _UP).mean()) if len(roots) else 1.0
+    return float((up_of_root(roots) @ np.asarray(up) > _UP).mean()) if len(roots) else 1.0
 
 
 def axis_of(roots: Array) -> str:

@@ -30,6 +30,12 @@ class RecordingOptions(DressOptions):
     keypoints: str | None = setting(None, "which points of the body, with keypoints as input (zed38)", choices=LAYOUTS)
     person: str | None = setting(None, "person to dress, where the input has several", metavar="NAME")
     input_axes: Axes = cli.axes_of("recorded", "those of the frame itself, left as they are")
+    frame_id: str = setting(
+        "",
+        "frame of the garments (default: map, or the input's own with --input-axes frame: its name then says what is "
+        "up, -y with optical in it, else z)",
+        metavar="ID",
+    )
     fps: float | None = cli.rate_of_files()
 
     def __post_init__(self) -> None:
@@ -52,9 +58,6 @@ class RecordingOptions(DressOptions):
 class ReplayOptions(RecordingOptions):
     output: Path | None = None
     speed: Literal["max", "real"] = setting("max", "as fast as possible, or paced (real)", choices=("max", "real"))
-    frame_id: str = setting(
-        "", "frame_id of the markers (default: map, or the input's own with --input-axes frame)", metavar="ID"
-    )
     max_frames: int | None = setting(None, "stop after N frames", parse=cli.positive, metavar="N")
     overwrite: bool = setting(False, "replace an existing output")
     evaluate: bool = setting(True, "check every frame for collisions; if not, only its latency is kept")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,27 @@ def test_frames_become_a_clip(form: str, tmp_path: Path) -> None:
     said = "; ".join(motion.notes)
     assert "frame by frame" in said
     assert ("2 persons" in said) == ("people" in form or "person" in form)
+
+
+@pytest.mark.parametrize("whole", [int, np.int64])
+@pytest.mark.parametrize("name", ["frame", "img_name"])
+def test_one_dictionary_per_person_and_frame(whole: Callable[[int], Any], name: str, tmp_path: Path) -> None:
+    """Trackers' own numbers tell people and lost frames, not where a dictionary is in the list."""
+    kept = [i for i in range(T) if i not in (10, 11)]
+    number = (lambda i: f"clip/{i:06}.jpg") if name == "img_name" else whole
+    people = [person(i, x) | {"track_id": whole(int(x)), name: number(i)} for i in kept for x in (3.0, 0.0)]
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(people))
+    for x in (0, 3):
+        motion = read_motion(tmp_path / "a.pkl", fps=30, person=str(x))
+        assert len(motion) == T
+        assert "2 of 30 frames are missing: interpolated" in motion.notes
+        np.testing.assert_allclose(motion.transl[kept], TRANSL[kept] + [x, 0, 0])
+
+
+def test_a_list_too_long_to_read_says_how_to_save_it(tmp_path: Path) -> None:
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps([person(0)] + [{"frame": i} for i in range(300_000)]))
+    with pytest.raises(MotionFileError, match="too many values: save one array for all frames"):
+        read_motion(tmp_path / "a.pkl", fps=30)
 
 
 ODD_ROWS: dict[str, dict[str, Any]] = {

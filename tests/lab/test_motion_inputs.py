@@ -133,6 +133,22 @@ def test_garments_are_in_the_frame_that_their_people_are_in(tmp_path: Path) -> N
         assert adapters.decode_marker_array(message.data)[0].frame_id == frame_id
 
 
+@pytest.mark.parametrize("input_type", ["multiarray", "joint_state"])
+def test_the_frame_that_is_asked_for_says_which_way_is_up(tmp_path: Path, input_type: str) -> None:
+    """A camera's message without a frame, or of one that isn't called optical."""
+    pose = np.zeros((24, 3), np.float32)
+    pose[0, 0] = np.pi  # y is down
+    with adapters.BagWriter(tmp_path / "seen.mcap") as writer:
+        writer.add_topic("/smpl_params", adapters.INPUT_TYPES[input_type])
+        raw = adapters.encoder_for(input_type)(SmplFrame(pose, stamp_ns=10**9), frame_id="camera")
+        writer.write("/smpl_params", raw, log_time_ns=10**9)
+    for frame_id, up, said in (("", [0, 0, 1], "frame_id has z up"), ("camera_optical", [0, -1, 0], "")):
+        result = run(tmp_path / "seen.mcap", input_axes="frame", frame_id=frame_id)
+        np.testing.assert_array_equal(result.frames[0].frame.up, up)
+        assert bool(result.warnings) == bool(said)
+        assert said in "".join(result.warnings)
+
+
 def test_another_gender_is_said(tmp_path: Path) -> None:
     result = run(z_up(tmp_path / "a.npz", gender="female"))
     assert any("of a female body and is dressed as male" in text for text in result.warnings)

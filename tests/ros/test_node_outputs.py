@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import signal
@@ -439,6 +440,24 @@ def test_a_cameras_frame_is_written_to_the_log_without_its_control_characters(
     scene.until(warned, "it is warned of")
     assert "\x1b" not in said
     assert "eye\\x1b[2J" in said
+
+
+@pytest.mark.parametrize(("frame_id", "is_told"), [("camera", True), ("camera_optical", False)])
+def test_an_output_frame_in_which_people_stand_on_their_heads_is_told(
+    robot: Callable[..., Robot], capfd: pytest.CaptureFixture[str], frame_id: str, is_told: bool
+) -> None:
+    scene = robot(garments=[TSHIRT], input_axes="frame", frame_id=frame_id)
+    scene.hear("garments", MarkerArray)
+    pose, stamps = np.zeros((24, 3)), itertools.count(10**9, 10**8)
+    pose[0, 0] = np.pi  # y is down
+
+    def came() -> bool:
+        sent = SmplFrame(pose, stamp_ns=next(stamps))
+        scene.peer.send_raw(encoder_for("joint_state")(sent, frame_id=frame_id))
+        return len(scene.node._listener.doubts.of_senders) > 0
+
+    scene.until(came, "they are judged")
+    assert ("heads are towards -y: input_axes is frame, and frame_id has z up" in capfd.readouterr().err) == is_told
 
 
 def test_an_input_waits_for_its_transform(robot: Callable[..., Robot], foreign: Callable[..., Any]) -> None:
