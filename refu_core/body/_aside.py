@@ -52,7 +52,7 @@ class Aside:
     Each middle that is inside asks for the least turn that brings it to the surface, of both arms if it is inside the
     other one; deep ones count most. So arms move continuously, and where no middle is inside, nothing moves. The
     exception is an arm that is half-way through the trunk, a thigh or the other arm: there the nearest way out changes
-    sides, and the arm leaps.
+    sides, and the arm leaps. In the other arm, which is thin, some middle is always close to that.
     """
 
     def __init__(self, body: SmplBody, mesh: Connectivity, *, farthest: float, rounds: int) -> None:

@@ -38,6 +38,9 @@ POSES = {
 INSIDE = {
     "hand in the hip": {"left_shoulder": (0, 0, -1.54), "right_shoulder": (0, 0, 1.53)},
     "hand in a thigh that is lifted": {"left_shoulder": (0, 0, -1.5), "left_hip": (0, 0, 0.23)},
+}
+"""Poses in which an arm is inside the body: it goes aside as a whole."""
+CROSSED = {
     "forearms in each other": {
         "left_shoulder": (0, -1.59, -0.15),
         "right_shoulder": (0, 1.61, 0.14),
@@ -45,8 +48,8 @@ INSIDE = {
         "right_elbow": (0, 0.79, 0),
     },
 }
-"""Poses in which an arm is inside the body or the other arm: it goes aside as a whole."""
-ALL = POSES | INSIDE
+"""The same of two arms, which both do. On the way there they leap, as they are thin."""
+ALL = POSES | INSIDE | CROSSED
 
 
 def posed(body: SmplBody, turns: dict[str, tuple[float, float, float]]) -> torch.Tensor:
@@ -125,7 +128,7 @@ def test_it_sees_the_pose_alone(body: SmplBody, collider: Collider) -> None:
     torch.testing.assert_close(collider(together.vertices, together.transforms), torch.cat(alone), rtol=0, atol=1e-5)
 
 
-@given(st.sampled_from(sorted(ALL)), st.floats(0.2, 1.0))
+@given(st.sampled_from(sorted(POSES | INSIDE)), st.floats(0.2, 1.0))
 def test_it_follows_the_pose_without_jumps(name: str, share: float) -> None:
     body, collider = _the_same()
     poses = torch.cat([s * posed(body, ALL[name]) for s in (share, share - 0.005)])
@@ -133,6 +136,17 @@ def test_it_follows_the_pose_without_jumps(name: str, share: float) -> None:
     apart = collider(skin.vertices, skin.transforms)
     (a, b), (skin_a, skin_b) = apart, skin.vertices
     assert ((a - b).norm(dim=1) <= 1.5 * (skin_a - skin_b).norm(dim=1).max() + 3 * MM).all()
+
+
+def test_arms_that_go_through_each_other_leap_by_half_of_their_thickness_at_most(
+    body: SmplBody, collider: Collider
+) -> None:
+    pose = posed(body, CROSSED["forearms in each other"])
+    skin = body(pose=torch.cat([share * pose for share in np.arange(0.8, 1.0, 0.005)]))
+    way, of_skin = (
+        (one[1:] - one[:-1]).norm(dim=2).amax(1) for one in (collider(skin.vertices, skin.transforms), skin.vertices)
+    )
+    assert float((way - 1.5 * of_skin).max()) < 40 * MM
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -162,11 +176,11 @@ def test_its_derivative_is_that_of_finite_differences(name: str, body: SmplBody,
     torch.testing.assert_close((gradient * way).sum(), slope, rtol=2e-2, atol=1e-2)
 
 
-@pytest.mark.parametrize("name", INSIDE)
+@pytest.mark.parametrize("name", INSIDE | CROSSED)
 def test_the_derivative_of_arms_that_go_aside(name: str, body: SmplBody, collider: Collider) -> None:
     double = body.to(dtype=torch.float64)
     random = torch.Generator().manual_seed(1)
-    pose = posed(double, INSIDE[name]).requires_grad_()
+    pose = posed(double, ALL[name]).requires_grad_()
     way, weight = (torch.randn(shape, generator=random, dtype=torch.float64) for shape in ((1, 24, 3), (6909, 3)))
 
     def seen(at: torch.Tensor) -> torch.Tensor:
@@ -203,10 +217,10 @@ def test_copies_of_an_outfit_keep_the_settings_of_its_collider(body: SmplBody) -
     assert {one.collider.settings for one in (outfit.beside(), outfit.to(torch.float64)) if one.collider} == {settings}
 
 
-@pytest.mark.parametrize("name", INSIDE)
+@pytest.mark.parametrize("name", INSIDE | CROSSED)
 def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Collider) -> None:
     """As a whole, hands unbent, by what it takes; nothing else moves. Two arms in each other both do."""
-    skin = body(pose=posed(body, INSIDE[name]))
+    skin = body(pose=posed(body, ALL[name]))
     aside, rotation = collider.aside(skin.vertices, skin.transforms.rotation)
     deep = collider.anatomy.aside._way_out(*_asked(collider, skin.vertices[0])).norm(dim=1)
     left = collider.anatomy.aside._way_out(*_asked(collider, aside[0])).norm(dim=1)
@@ -216,7 +230,7 @@ def test_arms_that_are_inside_go_aside(name: str, body: SmplBody, collider: Coll
     assert 10 * MM < way.max() < 60 * MM
     is_arm = body.weights[:, [joint for arm in ARMS for joint in arm]].sum(1) > 0
     assert way[~is_arm].max() == 0
-    if name == "forearms in each other":
+    if name in CROSSED:
         assert all(way[body.weights[:, list(arm)].sum(1) > 0.5].max() > 5 * MM for arm in ARMS)
     edges = collider.anatomy.edges[is_arm[collider.anatomy.edges].all(1)]
     before, after = ((one[0, edges[:, 0]] - one[0, edges[:, 1]]).norm(dim=1) for one in (skin.vertices, aside))
@@ -232,7 +246,7 @@ _HUG = (0, -1.47, 0.29), (0, 1.62, 0.42), (0, -2.0, 0), (0, 1.1, 0)
 
 def test_arms_turn_as_their_middles_ask(body: SmplBody, collider: Collider) -> None:
     """Against the definition, middle by middle: of arms in each other and in the chest."""
-    turns = dict(zip(INSIDE["forearms in each other"], _HUG, strict=True))
+    turns = dict(zip(CROSSED["forearms in each other"], _HUG, strict=True))
     points, middles = _asked(collider, body(pose=posed(body, turns)).vertices[0])
     aside, n = collider.anatomy.aside, len(middles) // 2
     pivots = aside._means(points[: len(body.v_template)])[: len(ARMS)]
