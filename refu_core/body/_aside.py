@@ -162,10 +162,9 @@ class Aside:
 
     def _recorded_look(self, solids: Solids, weights: Array, box: list[Any]) -> tuple[Recorded, Tensor]:
         """A launch that finds boxes, caps and middles (C, 3), and counts middles near each solid (`_n_near`)."""
-        corners, solid = [], []
+        corners, solid, parts = [], [], [joints for joints, _ in SOFTNESS]
         for s, faces in enumerate(solids.faces):
             own = faces[(faces < len(weights)).all(1)]
-            parts = [joints for joints, _ in SOFTNESS]
             part_of = part_of_faces(torch.from_numpy(weights), torch.from_numpy(own).long(), parts).numpy()
             for k in np.unique(part_of):
                 corners.append(np.unique(own[part_of == k]))

@@ -214,7 +214,7 @@ class Resolver(Unpicklable):
         """The `n` near vertices leave the body, and their neighbours follow."""
         alpha = self._floats["alpha"][:n]  # so far the distances that α is predicted from
         if callable(scale):
-            alpha.copy_(scale(self._ints["near"][:n], alpha))
+            alpha.copy_(scale(self._ints["near"][:n].long(), alpha))
         else:
             alpha.fill_(scale)
         self._run("scale")

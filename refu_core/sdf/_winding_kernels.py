@@ -18,7 +18,7 @@ from refu_core.sdf._crossing_kernels import double
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CELLS = wp.constant(64)
-"""Bins of the grid along x and along y."""
+"""Cells of the grid along x and along y."""
 STEPS = 4
 _ZERO = wp.constant(wp.float64(0.0))
 
@@ -70,7 +70,7 @@ def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, p: wp.vec3, half: int) -> int:
 
 @wp.func
 def per_metre_of(box: wp.array[wp.vec3]) -> wp.vec3:
-    """Bins per metre; a hair fewer than there are, so that the last point is in the last cell."""
+    """Cells per metre; a hair fewer than there are, so that the last point is in the last cell."""
     extent = box[1] - box[0]
     cells = wp.static(0.9999 * CELLS)
     return wp.vec3(

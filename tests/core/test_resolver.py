@@ -61,6 +61,7 @@ def both(garment: str, kind: str, body: Tensor, unposed: Tensor, points: Tensor)
     start = sdf.query(points, near=near)
 
     def scale(rows: Tensor, depth: Tensor) -> Tensor:
+        assert rows.dtype == torch.int64, "torch.gather takes no other"
         return 1.0 + 0.3 * torch.sin(rows) + 10 * depth.clamp(-0.01, 0.01)
 
     blend = Blend.of_faces(template.faces, template.n_vertices)
