@@ -161,9 +161,9 @@ def draw_collider() -> None:
 
 
 def draw_postures() -> None:
-    """Everyday postures, dressed; rows of seven."""
-    names, size = tuple(POSTURES), (200, 210)
-    rows = [collider_sheet(poses=names[i : i + 7], size=size, samples=4)[-210:] for i in range(0, len(names), 7)]
+    """Everyday postures, dressed; rows of eleven."""
+    names, size = tuple(POSTURES), (150, 180)
+    rows = [collider_sheet(poses=names[i : i + 11], size=size, samples=4)[-180:] for i in range(0, len(names), 11)]
     save_jpeg(np.concatenate(rows), "postures")
 
 

@@ -4,6 +4,7 @@ from refu_core.backbones._beyond import KINDS as KINDS
 from refu_core.backbones._beyond import Beyond as Beyond
 from refu_core.backbones._beyond import BeyondConfig as BeyondConfig
 from refu_core.backbones._beyond import WithBeyond as WithBeyond
+from refu_core.backbones._beyond import heels_share as heels_share
 from refu_core.backbones._beyond import legs_share as legs_share
 from refu_core.backbones._beyond import lying_share as lying_share
 from refu_core.backbones._decoder import BasisDecoder as BasisDecoder

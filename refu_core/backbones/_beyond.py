@@ -1,4 +1,4 @@
-"""What cloth does in postures that a backbone doesn't know, on top of it: who lies, or has legs apart or drawn up."""
+"""What cloth does in postures that a backbone doesn't know, on top of it: who lies, stretches legs, or runs."""
 
 from __future__ import annotations
 
@@ -27,6 +27,10 @@ APART = (math.cos(math.radians(85)), math.cos(math.radians(110)))
 """Cosines of the angles between the thighs; recorded ones are at 78° at most."""
 DRAWN_UP = (math.cos(math.radians(100)), math.cos(math.radians(120)))
 """Cosines of the angle by which a thigh is drawn up: in a chair it is 90°, in a squat 120°."""
+RAISED = (math.cos(math.radians(50)), math.cos(math.radians(75)))
+"""Cosines of the angle by which a lower leg is raised: who walks raises it by 50°, who runs by 90° and more."""
+BEHIND = (0.0, 0.4)
+"""How far a raised lower leg points backwards: by 0.4 of its length where the heel is at the seat."""
 
 
 def _faded(value: Tensor, range_: tuple[float, float]) -> Tensor:
@@ -53,25 +57,50 @@ def legs_share(pose: Tensor) -> Tensor:
     return (1 - (1 - sideways) * (1 - apart) * (1 - drawn_up)) * (1 - lying_share(pose))
 
 
-def _along(rotvec: Sequence[float]) -> tuple[float, float, float]:
-    """Where a rotation vector [rad] turns the y axis."""
+def heels_share(pose: Tensor) -> Tensor:
+    """How much some people (B, 24, 3) [rad] have a lower leg raised behind them, 0 to 1, shape (B,).
+
+    None of it is left of somebody who lies, or whose legs are apart or drawn up.
+    """
+    thighs, knees = rotvec_to_rotmat(pose[:, 1:3]), rotvec_to_rotmat(pose[:, 4:6])
+    legs = (thighs @ knees[..., 1:2])[..., 0]  # where lower legs point, turned round
+    left, right = (_faded(legs[..., 1], RAISED) * _faded(legs[..., 2], BEHIND)).unbind(1)
+    return (1 - (1 - left) * (1 - right)) * (1 - legs_share(pose)) * (1 - lying_share(pose))
+
+
+def _turned(rotvec: Sequence[float], way: Sequence[float] = (0.0, 1.0, 0.0)) -> tuple[float, float, float]:
+    """Where a rotation vector [rad] turns a direction, or the y axis."""
+    vx, vy, vz = way
     if not 0 < (angle := math.hypot(*rotvec)) < math.inf:
-        return 0.0, 1.0, 0.0
+        return vx, vy, vz
     x, y, z = (one / angle for one in rotvec)
     sine, cosine = math.sin(angle), math.cos(angle)
-    return (1 - cosine) * x * y - sine * z, cosine + (1 - cosine) * y * y, (1 - cosine) * y * z + sine * x
+    along = (1 - cosine) * (x * vx + y * vy + z * vz)
+    return (
+        along * x + cosine * vx + sine * (y * vz - z * vy),
+        along * y + cosine * vy + sine * (z * vx - x * vz),
+        along * z + cosine * vz + sine * (x * vy - y * vx),
+    )
 
 
 def _lies(pose: Sequence[Sequence[float]]) -> bool:
-    return abs(_along(pose[0])[1]) < TILTS[0]
+    return abs(_turned(pose[0])[1]) < TILTS[0]
+
+
+def _lies_flat(pose: Sequence[Sequence[float]]) -> bool:
+    return abs(_turned(pose[0])[1]) <= TILTS[1]
 
 
 def _stretches_legs(pose: Sequence[Sequence[float]]) -> bool:
-    up, left, right = map(_along, pose[:3])
-    if abs(up[1]) <= TILTS[1]:  # lies
-        return False
+    left, right = map(_turned, pose[1:3])
     between = sum(one * other for one, other in zip(left, right, strict=True))
-    return right[0] - left[0] > SIDEWAYS[0] or between < APART[0] or min(left[1], right[1]) < DRAWN_UP[0]
+    is_apart = right[0] - left[0] > SIDEWAYS[0] or between < APART[0] or min(left[1], right[1]) < DRAWN_UP[0]
+    return is_apart and not _lies_flat(pose)
+
+
+def _raises_heels(pose: Sequence[Sequence[float]]) -> bool:
+    legs = (_turned(hip, _turned(knee)) for hip, knee in zip(pose[1:3], pose[4:6], strict=True))
+    return any(y < RAISED[0] and z > BEHIND[0] for _, y, z in legs) and not _lies_flat(pose)
 
 
 @dataclass(frozen=True)
@@ -81,13 +110,17 @@ class _Kind:
     share: Callable[[Tensor], Tensor]
     """How much people (B, 24, 3) [rad] are in them, 0 to 1, shape (B,)."""
     is_any: Callable[[Sequence[Sequence[float]]], bool]
-    """Whether that is above zero for one person, by the rotation vectors of pelvis and hips [rad], shape (3, 3).
+    """Whether that may be above zero for one person, by the first six rotation vectors [rad], shape (6, 3).
 
     In Python: torch takes a hundred times as long for one person.
     """
 
 
-KINDS = {"lying": _Kind(lying_share, _lies), "legs": _Kind(legs_share, _stretches_legs)}
+KINDS = {
+    "lying": _Kind(lying_share, _lies),
+    "legs": _Kind(legs_share, _stretches_legs),
+    "heels": _Kind(heels_share, _raises_heels),
+}
 """Postures that a garment may have a network for, by that network's name."""
 
 
@@ -156,7 +189,7 @@ class WithBeyond(nn.Module):
         """Predicts as the backbone does, which is given what it is `told`, and adds what cloth does beyond."""
         displacement = self.known(betas, pose, style, **told)
         assert displacement is not None  # there are weights
-        people = pose[:, :3].tolist() if self._is_serial else []
+        people = pose[:, :6].tolist() if self._is_serial else []
         for one in self.beyond:
             assert isinstance(one, Beyond)
             if not self._is_serial or any(map(KINDS[one.kind].is_any, people)):

@@ -215,6 +215,15 @@ POSTURES = {
     "lying on the belly": "pelvis 90 0 0, neck -25 0 0, both_shoulder -18 8 38, both_elbow 0 -75 0, both_hip 0 0 8",
     "lying on the side": "pelvis 0 0 90, left_shoulder 0 0 55, right_shoulder 18 28 68, right_elbow 0 42 0, "
     "both_hip -28 0 0, both_knee 42 0 0",
+    "running": "pelvis 8 0 0, spine1 4 0 0, left_hip -22 0 4, left_knee 108 0 0, right_hip -32 0 -4, "
+    "right_knee 48 0 0, both_shoulder 10 -25 -70, both_elbow 0 -80 0",
+    "pushing off": "pelvis 10 0 0, spine1 4 0 0, left_hip 18 0 4, left_knee 78 0 0, right_hip -58 0 -4, "
+    "right_knee 72 0 0, both_shoulder 10 -25 -70, both_elbow 0 -80 0",
+    "sprinting": "pelvis 15 0 0, spine1 6 0 0, left_hip -48 0 4, left_knee 130 0 0, right_hip 8 0 -4, "
+    "right_knee 22 0 0, both_shoulder 10 -25 -70, both_elbow 0 -80 0",
+    "heel at the seat": "left_hip 4 0 2, left_knee 124 0 0, both_shoulder 18 -16 -83, both_elbow 0 -9 0",
+    "sitting on the heels": "both_hip -78 0 6, both_knee 142 0 0, both_ankle 30 0 0, both_shoulder 17 -35 -76, "
+    "both_elbow 0 -50 0",
 }
 """By name: rotation vectors [degrees] in SMPL's axes, x to the left, as `refu_core.skeleton.posed` reads them."""
 SELF_TOUCHING = tuple(POSTURES)[:8]

@@ -1,4 +1,4 @@
-"""Training of what cloth does in postures that a backbone doesn't know, on top of it: lying, legs apart or drawn up."""
+"""Training of what cloth does in postures that a backbone doesn't know, on top of it: lying, legs apart, running."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ def train_beyond(
     postures to learn from or test on; `WeightsError` for no tailornet there, or a damaged one.
 
     Args:
-        kind: `lying`, or `legs` for thighs that are apart or drawn up.
+        kind: `lying`, `legs` for thighs that are apart or drawn up, or `heels` for lower legs raised behind.
         folder: holds tailornet-<mode> and its basis, which are left as they are.
         rehearsal: bodies of the tailornet's plans. To those of them who are in such a posture nothing is added.
         mode: mode of the tailornet; modes that share a basis share this, too.
     """
     if kind not in nets.KINDS:
-        raise RefuError(f"no kind of postures {printable(kind)}: wanted {' or '.join(nets.KINDS)}")
+        raise RefuError(f"no kind of postures {printable(kind)}: wanted {', '.join(nets.KINDS)}")
 
     def who(pose: Tensor) -> Tensor:
         return nets.KINDS[kind].share(pose) > 0

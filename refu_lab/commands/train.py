@@ -12,7 +12,7 @@ from refu_core.options import setting
 from refu_core.recordings import Axes
 from refu_lab.commands import _common as cli
 
-BEYOND = ("lying", "legs")
+BEYOND = ("lying", "legs", "heels")
 """`refu_core.backbones.KINDS`, named without importing torch."""
 TRAIN_MODES = ("none", "hybrid", "approx", "accurate", "collision-approx", "collision-accurate")
 

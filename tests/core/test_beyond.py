@@ -1,4 +1,4 @@
-"""Cloth on people who lie, or whose legs are apart: what is added there, and that nobody else notices."""
+"""Cloth on people who lie, run, or have their legs apart: what is added there, and that nobody else notices."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from refu_core.backbones import (
     Beyond,
     BeyondConfig,
     WithBeyond,
+    heels_share,
     legs_share,
     load_backbone,
     lying_share,
@@ -62,14 +63,16 @@ def test_it_is_faded_in_without_a_step(degrees: float) -> None:
     assert here == (1 if 76 < degrees < 104 else here)
 
 
-@given(st.lists(st.lists(st.floats(-4, 4), min_size=3, max_size=3), min_size=3, max_size=3), st.sampled_from([*KINDS]))
+@given(st.lists(st.lists(st.floats(-4, 4), min_size=3, max_size=3), min_size=6, max_size=6), st.sampled_from([*KINDS]))
 def test_who_is_in_a_posture_is_whose_share_is_above_zero(turns: list[list[float]], kind: str) -> None:
     pose = torch.zeros(1, 24, 3, dtype=torch.float64)
-    pose[0, :3] = torch.tensor(turns)
+    pose[0, :6] = torch.tensor(turns)
     share = float(KINDS[kind].share(pose))
     if kind == "legs" and KINDS["lying"].is_any(turns):
         assert share < 1  # faded out towards who lies, down to zero
-    if not 0 < share < 1e-9:  # at the brink, rounding decides
+    if kind == "heels" and float(legs_share(pose)) > 0:
+        assert share < 1  # faded out towards whose legs are apart, down to zero
+    elif not 0 < share < 1e-9:  # at the brink, rounding decides
         assert KINDS[kind].is_any(turns) == (share > 0)
 
 
@@ -87,12 +90,34 @@ def test_sitting_is_known_and_squatting_is_not(both_hips: float, share: float) -
     assert float(legs_share(with_legs((both_hips, 0, 0), (both_hips, 0, 0)))) == share
 
 
+def with_knee(hip: float, knee: float) -> Tensor:
+    """Somebody upright whose right leg is bent so [degrees], shape (1, 24, 3)."""
+    pose = with_legs((0, 0, 0), (hip, 0, 0))
+    pose[0, 5, 0] = math.radians(knee)
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("hip", "knee", "share"), [(-20, 65, 0), (-85, 110, 0), (-98, 18, 0), (20, 60, 1), (-30, 120, 1), (5, 130, 1)]
+)
+def test_runners_raise_their_heels_and_who_walks_sits_or_kicks_does_not(hip: float, knee: float, share: int) -> None:
+    assert float(heels_share(with_knee(hip, knee))) == share
+
+
+@given(st.floats(-60, 20), st.floats(0, 140))
+def test_heels_are_faded_in_without_a_step(hip: float, knee: float) -> None:
+    here, there = (float(heels_share(with_knee(hip, one))) for one in (knee, knee + 0.5))
+    assert abs(here - there) < 0.06
+
+
 def test_who_lies_with_legs_apart_lies() -> None:
     pose = with_legs((0, 0, 50), (0, 0, -50))
     assert float(legs_share(pose)) == 1
     pose[0, 0] = tilted(90)[0, 0]
     assert float(legs_share(pose)) == 0
     assert float(lying_share(pose)) == 1
+    pose[0, 5, 0] = math.radians(110)
+    assert float(heels_share(pose)) == 0
 
 
 @pytest.mark.parametrize("degrees", [0, 45, 59.9, 125, 180])
@@ -175,10 +200,11 @@ def test_what_does_not_belong_together_is_refused(folder: Path, tmp_path: Path) 
 def test_kinds_of_postures_have_networks_of_their_own(folder: Path, tmp_path: Path) -> None:
     for file in (folder / "weights").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    garment, pose = load_garment(OWN), torch.cat((tilted(0), tilted(90), with_legs((-120, 0, 0), (-120, 0, 0))))
+    squat = with_legs((-120, 0, 0), (-120, 0, 0))
+    garment, pose = load_garment(OWN), torch.cat((tilted(0), tilted(90), squat, with_knee(-20, 120)))
     card = {"garment": OWN, "body_fingerprint": load_body("male").fingerprint}
     components = torch.linalg.qr(torch.randn(3 * garment.n_vertices, 2)).Q.T
-    given = torch.zeros(3, 10), pose, None
+    given = torch.zeros(4, 10), pose, None
     known = load_backbone("tailornet", OWN, mode="none", folder=tmp_path)(*given)
     changed = []
     for kind in KINDS:
@@ -186,11 +212,11 @@ def test_kinds_of_postures_have_networks_of_their_own(folder: Path, tmp_path: Pa
         save_beyond(tmp_path, Beyond(kind, BeyondConfig((0, 1, 2)), decoder), card)
         both = load_backbone("tailornet", OWN, mode="none", folder=tmp_path)
         changed.append(((both(*given) - known).abs().amax((1, 2)) > 0).tolist())
-    assert changed == [[False, True, False], [False, True, True]]
+    assert changed == [[False, True, False, False], [False, True, True, False], [False, True, True, True]]
 
 
 def test_no_such_kind(folder: Path) -> None:
-    with pytest.raises(RefuError, match="no kind of postures sitting: wanted lying or legs"):
+    with pytest.raises(RefuError, match="no kind of postures sitting: wanted lying, legs, heels"):
         train_beyond("sitting", OWN, folder / "lying", folder / "weights", rehearsal=Rehearsal(1))
 
 
