@@ -161,9 +161,10 @@ class Listener:
 
     def _listen(self, person: str, topic: str) -> None:
         full_name = self._node.resolve_topic_name(topic)
-        self._node.get_logger().info(f"listening to {full_name} ({self.stream.message_type})")
-        # Overrides are parameters, which are never removed: only topics that don't come and go have them.
+        # Logs are kept, and overrides are parameters, which are never removed: topics that come and go have neither.
         overrides = None if self._settings.follow_humans else QoSOverridingOptions.with_default_policies()
+        if overrides is not None:
+            self._node.get_logger().info(f"listening to {full_name} ({self.stream.message_type})")
         take = partial(self._come, person, full_name)
         self._hear(person, self.stream.message_type, topic, take, ros_qos(INPUT_QOS), qos_overriding_options=overrides)
 
@@ -354,13 +355,12 @@ class Listener:
             self._node.statistics.drop("crowd", f"{len(bodies)} bodies, up to {self.room} are dressed")
             bodies.sort(key=lambda one: one[0] not in self._inputs)
         here = tracked if tracked is not None else [one[0] for one in bodies] or [""] * (not tells)
-        self.expected = {one: self.expected.get(one, time.monotonic()) for one in map(printable, here)}
+        self.expected = {one: self.expected.get(one, time.monotonic()) for one in map(printable, [*here][: self.room])}
         return dict(bodies[: self.room])
 
     def _listen_to_tracked(self) -> None:
         def take(data: bytes) -> None:
-            self._tracked = {*adapters.decode_ids(data)}
-            self._follow_humans()
+            self._tracked = {*adapters.decode_ids(data)}  # followed once a second, however often that is sent
 
         with suppress(RefuError):  # without this message type, everybody with a topic counts as there
             self._hear(_TRACKED, adapters.IDS_LIST, _TRACKED, take, QoSProfile(depth=1))

@@ -104,8 +104,9 @@ class NodeSettings(DressOptions):
         for name, path in (("record", self.record), ("weights", self.weights), ("bags", self.bags)):
             if path and not _names_a_folder(path):
                 raise SettingsError(f"{name}: wanted the path of a folder, got {path!r}")
-        if 0 < self.max_rate < _SLOWEST_HZ:
-            raise SettingsError(f"max_rate: wanted {_SLOWEST_HZ:g} to 1000, or 0 for no limit, got {self.max_rate:g}")
+        for name, rate in (("max_rate", self.max_rate), ("keypoint_rate", self.keypoint_rate)):
+            if 0 < rate < _SLOWEST_HZ:
+                raise SettingsError(f"{name}: wanted 0, or {_SLOWEST_HZ:g} and more, got {rate:g}")
         self.check_garments()
         if any(self.style) and (plain := self.of_one_style):
             raise SettingsError(f"style: {', '.join(plain)} has no styles; set it to zeros")

@@ -88,6 +88,8 @@ def test_every_parameter_is_described() -> None:
         ({"betas": [1.0]}, "a list of 10 numbers"),
         ({"max_rate": -1}, "max_rate: wanted 0 to"),
         ({"max_rate": True}, "a number"),
+        ({"max_rate": 1e-300}, "max_rate: wanted 0, or 0.01"),
+        ({"keypoint_rate": 1e-300}, "keypoint_rate: wanted 0, or 0.01"),
         ({"persons": ["a", "a"]}, "distinct"),
         ({"persons": ["a", ""]}, "without a name"),
         ({"persons": ["a/b"]}, "letters"),

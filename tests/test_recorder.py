@@ -430,3 +430,25 @@ def test_a_disk_that_stalls_holds_nobody_up_who_records(tmp_path: Path) -> None:
     gate.set()  # which comes too late for who waits for the disk
     recorder.close()
     assert (recorder.state().error, recorder.state().written, recorder.state().at_risk_s) == ("", 100, 0)
+
+
+def test_a_disk_that_does_not_answer_holds_nobody_up_who_asks_how_it_goes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one on a network that has gone: the node's diagnostics waited for it, and with them all inputs."""
+    gate, usage = threading.Event(), shutil.disk_usage
+
+    def stalled(path: Path) -> Any:
+        assert threading.current_thread().name == "recorder"
+        assert gate.wait(60)
+        return usage(path)
+
+    monkeypatch.setattr(shutil, "disk_usage", stalled)
+    recorder = Recorder(tmp_path / "bag")
+    put(recorder, 0)
+    assert (recorder.state().written, recorder.state().free_bytes) == (0, None)
+    gate.set()
+    recorder.close()
+    state = recorder.state()
+    assert (state.written, state.size_bytes) == (1, (tmp_path / "bag" / "bag_0.mcap").stat().st_size)
+    assert state.free_bytes

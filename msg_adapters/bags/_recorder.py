@@ -157,6 +157,8 @@ class Recorder:
         """When the oldest message came that is written but not known to be on the disk; None if there is none."""
         self._synced = -math.inf
         """When the last sync began. It spaces syncs out: in a backlog every message has waited long enough for one."""
+        self._space: tuple[int, int | None] = 0, None
+        """Size of the file, and of what is free beside it. Only the recorder's thread asks the disk: it may stall."""
         self._error = ""
         self._stopping = False
         self._ended = ended
@@ -199,14 +201,9 @@ class Recorder:
         return not self._thread.is_alive()
 
     def state(self) -> RecorderState:
-        """The recording's state, for the diagnostics."""
-        try:
-            size = self._bag.file_path.stat().st_size
-            free: int | None = shutil.disk_usage(self.path).free
-        except OSError:
-            size, free = 0, None
+        """The recording's state, for the diagnostics; without waiting for the disk."""
         with self._changed:
-            now, oldest = time.monotonic(), self._unsynced
+            now, oldest, (size, free) = time.monotonic(), self._unsynced, self._space
             if oldest is None:
                 oldest = self._queue[0].since if self._queue else now
             return RecorderState(
@@ -220,11 +217,18 @@ class Recorder:
                 error=self._error,
             )
 
+    def _measure(self) -> None:
+        try:
+            self._space = self._bag.file_path.stat().st_size, shutil.disk_usage(self.path).free
+        except OSError:
+            self._space = 0, None
+
     def _run(self) -> None:
         message: _Message | None = None
         try:
             with self._bag:
                 while (message := self._next()) is not None:
+                    self._measure()
                     if message is _SYNC:
                         self._bag.sync()
                         self._unsynced = None
@@ -242,6 +246,7 @@ class Recorder:
                 self._dropped += self._written - kept + (message not in (None, _SYNC)) + len(self._queue)
                 self._written = kept
                 self._queue.clear()
+        self._measure()
         self._ended(self.state())
 
     def _next(self) -> _Message | None:

@@ -12,7 +12,7 @@ import webbrowser
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from refu_core import RefuError
 from refu_core._device import one_thread
@@ -105,7 +105,28 @@ def _serve(options: ViewOptions) -> viser.ViserServer:
         where = options.host if options.port is None else f"{options.host}:{options.port}"
         raise RefuError(f"{where} can't be listened on: it is taken, or no address of this machine (--port, --host)")
     with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(options.host):  # it prints a banner
-        return viser.ViserServer(host=options.host, port=options.port or DEFAULT_PORT, verbose=False)
+        server = viser.ViserServer(host=options.host, port=options.port or DEFAULT_PORT, verbose=False)
+    _hear_values_only(server)
+    return server
+
+
+def _hear_values_only(server: viser.ViserServer) -> None:
+    """Has the server hear nothing of its clients but which values the panel's controls have.
+
+    For whoever connects, viser would also put the scene on the web, take in files of any size as a control's value, and
+    set whatever else belongs to a control.
+    """
+    from viser._messages import GuiUpdateMessage
+
+    handlers = server._websock_server._incoming_handlers
+    (update,) = handlers[GuiUpdateMessage]
+
+    async def take(client: Any, message: Any) -> None:
+        if message.updates.keys() == {"value"}:
+            await update(client, message)
+
+    handlers.clear()
+    handlers[GuiUpdateMessage] = [take]
 
 
 @contextlib.contextmanager

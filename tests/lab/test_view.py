@@ -505,6 +505,44 @@ def test_pages_of_other_sites_are_not_served() -> None:
         server.stop()
 
 
+def test_clients_choose_values_and_nothing_else(film: DressedFilm, monkeypatch: pytest.MonkeyPatch) -> None:
+    """viser itself would put the people who are shown on the web, for anybody who connects, and take in any file."""
+    viser = pytest.importorskip("viser", reason="viser isn't installed (extra view)")
+    import msgspec
+    from viser import _messages as told
+    from websockets.sync.client import connect
+
+    shared = list[bool]()
+    monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda _: shared.append(True))
+    server = _serve(ViewOptions(dressing=RecordingOptions(input=Path())))
+    try:
+        player = Player(server, film)
+        speed, wire = player._speed._impl, player._wire._impl
+        file = {"transfer_uuid": "1", "filename": "a", "mime_type": "b", "part_count": 0, "size_bytes": 0}
+        sent = (
+            told.ShareUrlRequest(),
+            told.FileTransferStartUpload(source_component_uuid=speed.uuid, **file),
+            told.GuiUpdateMessage(speed.uuid, {"props": None}),
+            told.GuiUpdateMessage(wire.uuid, {"value": True, "props": None}),
+            told.GuiUpdateMessage(player._follows._impl.uuid, {"value": False}),
+        )
+        spoken = [f"viser-v{viser.__version__}"]
+        with connect(f"ws://localhost:{server.get_port()}", subprotocols=spoken, open_timeout=300) as page:
+            for message in sent:
+                page.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+            end = time.monotonic() + 300
+            while player._follows.value and time.monotonic() < end:
+                time.sleep(0.01)
+        assert player._follows.value is False
+        assert player._speed.value == "1 ×"
+        assert player._wire.value is False
+        assert speed.props is not None
+        player._show(0)
+    finally:
+        server.stop()
+    assert shared == []  # `stop` has waited for what was under way
+
+
 def test_an_interrupt_closes_the_viewer(bag: Path) -> None:
     pytest.importorskip("viser", reason="viser isn't installed (extra view)")
     lines: list[str] = []
