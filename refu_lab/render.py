@@ -164,7 +164,7 @@ def render(
     to_sun = _unit(np.asarray(backdrop.to_sun, dtype=np.float64))
     faces_wp = _array(faces.ravel(), wp.int32)
     mesh = wp.Mesh(_array(vertices, wp.vec3), faces_wp)
-    sun, sky = _light(mesh, vertices, smooth, to_sun)
+    sun, sky = _light(mesh, vertices, smooth, to_sun, sun_rays=_SUN_RAYS)
     on_vertices = [_array(_uncovered(x, sky < _COVERED, faces), wp.float32) for x in (sun, sky)]
     low, high = vertices.min(0), vertices.max(0)
     ground_y = float(low[1]) if backdrop.ground_height is None else backdrop.ground_height
@@ -179,7 +179,8 @@ def render(
     grid = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), -1).reshape(-1, 2) * step + grid_low
     ground = np.stack([grid[:, 0], np.full(len(grid), ground_y), grid[:, 1]], 1).astype(np.float32)
     upward = np.broadcast_to(np.array([0, 1, 0], np.float32), ground.shape)
-    ground_light = [wp.array(x.reshape(cells, cells), device="cpu") for x in _light(mesh, ground, upward, to_sun)]
+    shares = _light(mesh, ground, upward, to_sun, sun_rays=_SUN_RAYS)
+    ground_light = [wp.array(x.reshape(cells, cells), device="cpu") for x in shares]
 
     image = wp.zeros((height, width), dtype=wp.vec3, device="cpu")
     wp.launch(
@@ -260,7 +261,7 @@ def _light(
     normals: NDArray[np.float32],
     to_sun: NDArray[np.float64],
     *,
-    sun_rays: int = _SUN_RAYS,
+    sun_rays: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Shares of the sun and the sky that N points (N, 3) of these normals see past a Warp mesh, each of shape (N,)."""
     sun, sky = (wp.zeros(len(points), dtype=wp.float32, device="cpu") for _ in range(2))

@@ -42,6 +42,7 @@ os.register_at_fork(after_in_child=gc.freeze)
 LONGEST = (
     "lab/test_replay.py",
     "test_style.py",
+    "ros/test_node_outputs.py",
     "ros/test_packaging.py",
     "core/test_simulation.py",
     "core/test_simulation_lanes.py",
@@ -56,8 +57,8 @@ LONGEST = (
     "core/test_kernel_bounds.py",
     "core/test_fitting_files.py",
     "core/test_own_body.py",
-    "ros/test_node_outputs.py",
     "test_faults.py",
+    "test_arguments.py",
     "ros/test_node.py",
     "ros/test_node_lazy.py",
     "core/test_training_refu.py",

@@ -29,6 +29,7 @@ from refu_lab.render import save_png
 from refu_lab.replay import _paced
 from refu_lab.tables import REPLAY_TITLE, html_page
 from tests.core.test_files import SPECIAL
+from tests.forked import run_forked
 from tests.lab.test_interrupts import Interrupting
 from tests.virtual_time import VirtualTime
 
@@ -248,26 +249,39 @@ def test_values_that_no_command_takes(arguments: list[str], capsys: pytest.Captu
     refused(arguments, capsys)
 
 
+PLAIN = ["--garments", "short-pant-male", "--backbone", "skinned", "--sdf", "none", "--no-collider"]
+"""What is dressed soonest."""
+
+
 @pytest.mark.parametrize(
     ("package", "extra", "arguments"),
     [
-        ("tqdm", "lab", ["replay", BAG]),
+        ("tqdm", "lab", ["replay", BAG, *PLAIN]),
         ("matplotlib", "lab", ["replay", BAG, "--report", "report"]),
         ("numba", "train", ["simulate", "tshirt-male", "--count", "1", "--output", "set"]),
     ],
 )
 def test_an_extra_that_is_missing_is_named(package: str, extra: str, arguments: list[str], tmp_path: Path) -> None:
-    """In an interpreter of its own, which can't import the package."""
-    code = f"import sys; sys.modules[{package!r}] = None; from refu_lab.cli import main; sys.exit(main(sys.argv[1:]))"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    def run() -> int:
+        sys.modules[package] = None  # type: ignore[assignment]  # as Python has it: it can't be imported
+        from refu_lab.cli import main
+
+        return main(arguments)
+
+    done = run_forked(run, cwd=tmp_path, forgets=(package, "msg_adapters", "refu_core", "refu_lab"))
     assert done.returncode == 2
     assert done.stderr == f'refu: error: {package} is not installed: pip install "refu-ros[{extra}]"\n'
     assert not any(tmp_path.iterdir())
 
 
-REFU = [sys.executable, "-m", "refu_lab"]
+SAYS_SOMETHING = """
+import sys
+from refu_lab.__main__ import main
+from refu_lab.commands import _common, garment
+garment.run_list = lambda args: _common.tell(args, "all garments", {})
+sys.exit(main())
+"""
+"""`refu`, whose `garment list` reads no garment: that takes seconds."""
 
 
 @pytest.mark.parametrize("buffered", [True, False], ids=["buffered", "at once"])
@@ -276,14 +290,15 @@ def test_whose_reader_has_gone_ends_quietly(arguments: list[str], *, buffered: b
     read, write = os.pipe()
     os.close(read)
     environment = os.environ | {"PYTHONUNBUFFERED": "" if buffered else "1"}
-    done = subprocess.run([*REFU, *arguments], env=environment, stdout=write, stderr=subprocess.PIPE, check=False)
+    command = [sys.executable, "-c", SAYS_SOMETHING, *arguments]
+    done = subprocess.run(command, env=environment, stdout=write, stderr=subprocess.PIPE, check=False)
     os.close(write)
     assert (done.returncode in (0, _common.EXIT_UNREAD), done.stderr) == (True, b"")
 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["-c", "import refu_core._warp"], ["-m", "refu_lab", "export", "bags/walk", "--output={}"]],
+    [["-c", "import refu_core._warp"], ["-m", "refu_lab", "export", "bags/walk", "--output={}", *PLAIN]],
     ids=["library", "command"],
 )
 def test_without_standard_streams_it_works_as_with_them(arguments: list[str], tmp_path: Path) -> None:
@@ -295,7 +310,7 @@ def test_without_standard_streams_it_works_as_with_them(arguments: list[str], tm
 def test_output_that_cannot_be_written_is_one_line() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     with Path("/dev/full").open("w") as full:
-        command = [*REFU, "garment", "list"]
+        command = [sys.executable, "-m", "refu_lab", "garment", "list"]
         done = subprocess.run(command, env=environment, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr) == (2, "refu: error: [Errno 28] No space left on device\n")
 
@@ -303,9 +318,8 @@ def test_output_that_cannot_be_written_is_one_line() -> None:
 def test_a_terminal_without_arrows_gets_the_rest(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = "--max-frames 1 --garments short-pant-male --backbone skinned --sdf none --quiet"
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding="latin-1"))
-    assert main(["replay", BAG, *options.split()]) == 0
+    assert main(["replay", BAG, *PLAIN, "--max-frames", "1", "--quiet"]) == 0
     assert b"before ? after collision handling" in b" ".join(sys.stdout.buffer.getvalue().split())  # type: ignore[attr-defined]
     assert capsys.readouterr().err == ""
 

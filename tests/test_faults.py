@@ -10,10 +10,8 @@ import re
 import resource
 import runpy
 import struct
-import subprocess
 import sys
 import threading
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -42,6 +40,7 @@ from refu_ros._diagnostics import Situation, statuses
 from refu_ros._settings import NodeSettings
 from refu_ros._worker import Worker
 from tests.core.test_files import SPECIAL
+from tests.forked import run_forked
 from tests.fuzz.corpus import small_weights
 from tests.limits import refusal
 
@@ -446,24 +445,11 @@ def test_a_disk_that_stalls_costs_messages_and_no_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("what", "times"), [("recording", 4), ("training", 3)])
-def test_kills_leave_what_can_be_read_and_gone_on_with(
-    what: str, times: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_kills_leave_what_can_be_read_and_gone_on_with(what: str, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", [str(KILL_TEST), "--what", what, "--times", str(times)])
-    child = os.fork()  # a copy of this process begins at once, a new one would import torch
-    if not child:
-        status = 1
-        try:
-            status = runpy.run_path(str(KILL_TEST))["main"]()
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            os._exit(status)
-    status = os.waitpid(child, 0)[1]
-    printed = capfd.readouterr()
-    assert status == 0, printed
-    assert f"{what}: {times} kills" in printed.out
+    done = run_forked(lambda: runpy.run_path(str(KILL_TEST))["main"]())
+    assert done.returncode == 0, done
+    assert f"{what}: {times} kills" in done.stdout
 
 
 def test_the_kill_test_notices_damage(tmp_path: Path) -> None:
@@ -478,35 +464,30 @@ def test_the_kill_test_notices_damage(tmp_path: Path) -> None:
 
 # Networks -----------------------------------------------------------------------------------------
 
-OFFLINE = """
-import json, sys
-def refuse(event, arguments):
-    if event in ("socket.connect", "socket.getaddrinfo", "socket.bind", "socket.sendto", "socket.gethostbyname"):
-        sys.stderr.write(f"network: {event} {arguments}\\n")
-        raise OSError("there is no network")
-sys.addaudithook(refuse)
-from refu_lab.cli import main
-for arguments in json.loads(sys.argv[1]):
-    assert main(arguments) == 0
-assert not {"dask", "distributed", "tornado"} & set(sys.modules), sorted(sys.modules)
-"""
 
-
-def test_replays_ask_no_network_for_anything_and_need_no_dask(tmp_path: Path) -> None:
+def test_replays_ask_no_network_for_anything_and_need_no_dask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one recording, and of several: Dask is imported where several processes are asked for."""
     walk, other = (str(Path(__file__).parents[1] / "bags" / name) for name in ("walk", "reach_squat"))
     options = ["--garments", GARMENT, "--max-frames", "2", "--backbone", "skinned", "--sdf", "accurate", "--quiet"]
     replays = [["replay", walk, "--output", str(tmp_path / "out.mcap"), *options], ["replay", walk, other, *options]]
-    proxies = dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"), "http://127.0.0.1:9")
-    done = subprocess.run(
-        [sys.executable, "-c", OFFLINE, json.dumps(replays)],
-        capture_output=True,
-        text=True,
-        timeout=1200,
-        check=False,
-        env={**os.environ, **proxies, "HF_HUB_OFFLINE": "1"},
-    )
-    assert done.returncode == 0, done.stderr
+    for name in ("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    dask = {"dask", "distributed", "tornado"}
+
+    def refuse(event: str, arguments: object) -> None:
+        if event in ("socket.connect", "socket.getaddrinfo", "socket.bind", "socket.sendto", "socket.gethostbyname"):
+            sys.stderr.write(f"network: {event} {arguments}\n")
+            raise OSError("there is no network")
+
+    def run() -> int:
+        sys.addaudithook(refuse)
+        from refu_lab.cli import main
+
+        return max(map(main, replays)) or bool(dask & set(sys.modules))
+
+    done = run_forked(run, forgets=(*dask, "fsspec", "msg_adapters", "refu_core", "refu_lab"))
+    assert done.returncode == 0, done
     assert "network:" not in done.stderr
     with BagReader(tmp_path / "out.mcap") as reader:
         assert {topic.message_count for topic in reader.topics} == {2}

@@ -1216,7 +1216,8 @@ def test_without_a_folder_no_file_may_be_named() -> None:
 
 def test_who_asks_too_often_is_told_so() -> None:
     dresser, go = RequestDresser(), threading.Event()
-    settings = NodeSettings(garments=("short-pant-male",), backbone="skinned")
+    plain: dict[str, Any] = {"backbone": "skinned", "sdf": "none", "collider": False}
+    settings = NodeSettings(garments=(GARMENT,), **plain)
     frame = SmplFrame(np.zeros((24, 3)))
     try:
         waiting = [dresser.ask(frame, settings, lambda *_: go.wait(60)) for _ in range(8)]
@@ -1224,17 +1225,17 @@ def test_who_asks_too_often_is_told_so() -> None:
             dresser.ask(frame, settings, lambda *_: None)
         go.set()
         assert all(one.result(60) for one in waiting)
-        seen = dresser.ask(frame, settings, lambda _, placed: placed["short-pant-male"]).result(60)
+        seen = dresser.ask(frame, settings, lambda _, placed: placed[GARMENT]).result(60)
     finally:
         go.set()
         dresser.close()
-    wanted = GarmentPipeline.load(["short-pant-male"], backbone="skinned")(frame)["short-pant-male"].local
+    wanted = GarmentPipeline.load([GARMENT], **plain)(frame)[GARMENT].local
     np.testing.assert_array_equal(seen, wanted[:, [2, 0, 1]])
 
 
 def test_work_on_request_gives_way_to_a_node_that_gives_way_itself() -> None:
     """Its niceness was 10 whatever the node's was; from a larger one only root may go back to that."""
-    settings = NodeSettings(garments=("short-pant-male",), backbone="skinned", sdf="none")
+    settings = NodeSettings(garments=(GARMENT,), backbone="skinned", sdf="none", collider=False)
 
     def ask() -> int:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)

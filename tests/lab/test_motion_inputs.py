@@ -80,6 +80,7 @@ def test_numbers_beyond_those_of_messages_are_refused_by_name(
     assert "3 x transl: wanted magnitudes up to 1e+09, got 1e+300" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("little_light")
 def test_z_up_is_seen_and_pictures_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Any] = []
 

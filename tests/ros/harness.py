@@ -39,7 +39,13 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 GARMENTS = ("tshirt-male", "short-pant-male")
-CHEAP = {"input_type": "joint_state", "garments": [GARMENTS[0]], "backbone": "skinned", "sdf": "none"}
+CHEAP = {
+    "input_type": "joint_state",
+    "garments": [GARMENTS[0]],
+    "backbone": "skinned",
+    "sdf": "none",
+    "collider": False,
+}
 """Parameters of a node that starts soonest, and says what it says in no time."""
 PATIENCE_S = 300.0
 """How long anything that has to happen may take, on a machine that has a lot to do: nobody waits any longer for what

@@ -305,8 +305,9 @@ def dds(peer: Any, kind: Any, topic: bytes) -> Iterator[Callable[[bytes], int]]:
         rmw.rmw_destroy_publisher(own, made)
 
 
-def test_names_that_are_no_text_silence_nobody(ros: None) -> None:  # noqa: ARG001
+def test_names_that_are_no_text_silence_nobody(ros: None, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: ARG001
     """rclpy names no node, or no topic, while one of them isn't UTF-8: diagnostics ended for good."""
+    monkeypatch.setattr("refu_ros._node._BEAT_S", 0.2)
     scene, ann, context = NodeHere(**CHEAP, follow_humans=True), Peer("ann", topic=BODY), rclpy.Context()
     rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     stranger = rclpy.create_node("stranger", context=context)  # what comes from its own process a node doesn't heed

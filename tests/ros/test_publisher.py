@@ -228,11 +228,10 @@ def test_bad_parameters_are_one_line(tmp_path: Path) -> None:
     assert line.startswith("smpl_publisher: error: nowhere: can't be read: No such file or directory; wanted")
 
 
-def test_an_unknown_ros_argument_is_one_line() -> None:
-    command = [sys.executable, "-m", "refu_ros.smpl_publisher", "--ros-args", "--nonsense"]
-    done = subprocess.run(command, cwd=BAGS.parent, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
-    assert done.returncode == 2
-    assert done.stderr == "smpl_publisher: error: no such arguments after --ros-args: ['--nonsense']\n"
+def test_an_unknown_ros_argument_is_one_line(tmp_path: Path) -> None:
+    log = tmp_path / "log.txt"
+    assert run_program("smpl_publisher", ["--ros-args", "--nonsense"], log=log).wait(PATIENCE_S) == 2
+    assert log.read_text() == "smpl_publisher: error: no such arguments after --ros-args: ['--nonsense']\n"
 
 
 def test_without_standard_streams_it_runs_as_with_them() -> None:
