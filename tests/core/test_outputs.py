@@ -249,7 +249,7 @@ def test_a_garment_that_planners_cannot_have_keeps_no_other_from_them() -> None:
         shapedirs=shirt.shapedirs.view(-1, 3, 10)[rows].reshape(-1, 10),
         styledirs=None,
     )
-    worn = GarmentPipeline.load([torn, shorts], backbone="skinned", certify=False)
+    worn = GarmentPipeline.load([torn, shorts], backbone="skinned", sdf="none", collider=False)
     fittings, obstacles = Fittings(worn), Obstacles()
     frame = SmplFrame(pose=np.zeros((24, 3)))
     dressed = DressedPerson("", frame, worn(frame), fittings, np.eye(3), np.zeros(3))

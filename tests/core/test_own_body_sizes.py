@@ -25,7 +25,7 @@ def sized(tall: float) -> SmplBody:
     return SmplBody(type(load_body("male").arrays).from_mapping({**arrays, **scaled}, source="test"), name="sized")
 
 
-@pytest.mark.parametrize("tall", [0.58, 1.0, 2.4])
+@pytest.mark.parametrize("tall", [0.58, 2.4])
 def test_a_body_of_any_size_is_registered_as_one_of_usual_height(tall: float) -> None:
     """Its garments are as large as it is; cloth stays as far off its skin as it is off an adult's."""
     usual, other = load_fit(sized(min(max(tall, 1.5), 2.0))), load_fit(sized(tall))
@@ -55,9 +55,10 @@ def test_folds_are_as_large_as_the_body() -> None:
     frame = SmplFrame(0.3 * np.sin(np.arange(72.0)).reshape(24, 3))
     draped = []
     for tall in (0.58, 1.5):  # which other tests have registered, too
-        pipeline = GarmentPipeline.load(["tshirt-male"], body=sized(tall), sdf="none")
-        skinned = GarmentPipeline.load(["tshirt-male"], body=sized(tall), sdf="none", backbone="skinned")
-        draped.append(pipeline(frame)["tshirt-male"].raw - skinned(frame)["tshirt-male"].raw)
+        pipeline = GarmentPipeline.load(["tshirt-male"], body=sized(tall), sdf="none", collider=False)
+        garment, posed = pipeline.garments["tshirt-male"], pipeline.body(frame.pose[None])
+        skinned = garment.pose(garment.rest(torch.zeros(1, 10)), posed.transforms)[0]
+        draped.append(pipeline(frame)["tshirt-male"].raw - skinned.numpy())
     assert np.abs(draped[1]).max() > 20 * MM
     assert np.abs(draped[0] - 0.58 / 1.5 * draped[1]).max() < 3 * MM
 

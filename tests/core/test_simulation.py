@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import fcl
-import igl
 import numpy as np
 import pytest
 import torch
@@ -133,20 +132,28 @@ def fcl_pairs(first: NDArray[Any], first_faces: NDArray[Any], second: NDArray[An
 # What is simulated ----------------------------------------------------------------------------------------------------
 
 
-def test_nothing_collides_by_three_judges(samples: list[GarmentSample]) -> None:
-    garment, body = load_garment(GARMENT), load_body("male")
-    faces, body_faces = garment.faces.numpy(), body.faces.numpy()
-    checker = CollisionChecker(body.faces)
+@pytest.fixture(scope="module")
+def verifier() -> Any:
+    """The script that judges whole sets."""
+    path = Path(refu_core.__file__).parents[1] / "scripts" / "verify_dataset.py"
+    spec = importlib.util.spec_from_file_location("verify_dataset", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_nothing_collides_by_three_judges(verifier: Any, simulated: Path, samples: list[GarmentSample]) -> None:
+    """The script's two, fcl and libigl, and the project's own."""
+    report = verifier.summary(list(verifier.verdicts(simulated)))
+    assert (report["garments"], report["bad"]) == (COUNT, [])
+    assert 0 < report["smallest_clearance_mm"] < 4
+    garment, checker = load_garment(GARMENT), CollisionChecker(load_body("male").faces)
     for sample in samples:
-        posed = body_of(sample)
-        checker.update(posed.astype(np.float32))
-        assert checker.check(sample.vertices, faces).is_free
-        assert not len(fcl_pairs(sample.vertices, faces, posed, body_faces))
-        winding = igl.fast_winding_number(posed, body_faces, sample.vertices.astype(np.float64))
-        assert np.abs(winding).max() < 0.5
-        own = fcl_pairs(sample.vertices, faces, sample.vertices, faces)
-        shared = (faces[own[:, 0]][:, :, None] == faces[own[:, 1]][:, None]).any((1, 2))
-        assert shared.all()
+        checker.update(body_of(sample).astype(np.float32))
+        assert checker.check(sample.vertices, garment.faces).is_free
 
 
 def test_a_hanging_arm_stays_where_it_is() -> None:
@@ -230,23 +237,7 @@ def test_selector_names_the_cause(samples: list[GarmentSample]) -> None:
     assert {"body_collision", "stretch", "unsettled", "self_intersection"} == set(CAUSES)
 
 
-@pytest.fixture(scope="module")
-def verifier() -> Any:
-    """The script that judges whole sets."""
-    path = Path(refu_core.__file__).parents[1] / "scripts" / "verify_dataset.py"
-    spec = importlib.util.spec_from_file_location("verify_dataset", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_verifier_finds_nothing_in_a_set_and_every_fault(verifier: Any, simulated: Path, tmp_path: Path) -> None:
-    report = verifier.summary(list(verifier.verdicts(simulated)))
-    assert (report["garments"], report["bad"]) == (COUNT, [])
-    assert 0 < report["smallest_clearance_mm"] < 4
+def test_verifier_finds_every_fault(verifier: Any, simulated: Path, tmp_path: Path) -> None:
     path = shutil.copytree(simulated, tmp_path / "spoilt")
     vertices = Rows(path, FORMAT, mode="r+").arrays["vertices"]
     vertices[0, :, 0] += round(0.02 / QUANTUM)

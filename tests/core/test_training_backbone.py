@@ -438,7 +438,7 @@ def test_a_log_goes_on_where_its_run_was_interrupted(tmp_path: Path) -> None:
 
 
 _PARALLEL = """
-import sys, torch
+import sys, torch, torch._dynamo  # which each of the two would import for its optimiser
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 from refu_core.backbones import MlpConfig
 from refu_core.training import LoopSettings, PretrainSettings, TrainingLog, pretrain

@@ -24,6 +24,7 @@ from refu_core.training._pretrain import tell_of
 from refu_core.training._rehearsal import _SEEDS_APART, symmetric
 from refu_core.weights import Weights, load_weights
 
+pytestmark = pytest.mark.usefixtures("no_curves_in_module")
 GARMENT = "short-pant-male"
 PLAN = SamplePlan(GARMENT, 60, pivots=4, recorded_share=0.0)
 LOOP = LoopSettings(batch_size=16, learning_rate=1e-2, weight_decay=0.01, check_every=20)
@@ -47,7 +48,7 @@ def made(folder: Path, *, spread: float, by: float, plan: SamplePlan = PLAN) -> 
 
 
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def first(no_curves_in_module: None, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: ARG001
     """Weights of hips bent by .2, where cloth is lifted."""
     folder = tmp_path_factory.mktemp("first")
     data = made(folder / "set", spread=0.2, by=0.05)
@@ -138,7 +139,6 @@ def test_a_plan_without_end_is_not_counted_out(first: Path) -> None:
     assert len(Rehearsal(5).of({"garment": GARMENT, "dataset": {"plan": asdict(plan)}}, network)) == 5
 
 
-@pytest.mark.usefixtures("no_curves")
 def test_weights_that_need_another_basis_keep_theirs(first: Path, further: Path, tmp_path: Path) -> None:
     """Those of a folder that were trained from scratch before."""
     folder = tmp_path / "own"
@@ -166,7 +166,6 @@ def errors(stored: Weights, spread: float, by: float) -> float:
     return float((predicted - lifted(pose, by=by)).norm(dim=-1).mean())
 
 
-@pytest.mark.usefixtures("no_curves")
 def test_learns_beyond_what_it_saw_and_forgets_less(first: Path, further: Path, tmp_path: Path) -> None:
     before = load_weights(first / "mlp-none")
     how: dict[str, Any] = {"backbone": "mlp", "settings": QUICK, "start": first, "quiet": True}
@@ -219,7 +218,6 @@ def test_what_is_said_of_the_mirrored_person_teaches_too(first: Path) -> None:
         assert asymmetry(symmetric(network, mirror)) < 0.1 * asymmetry(network)
 
 
-@pytest.mark.usefixtures("no_curves")
 def test_a_network_becomes_symmetric_without_samples(first: Path, tmp_path: Path) -> None:
     garment, before = load_garment(GARMENT), load_weights(first / "mlp-none")
     mirror = Mirror.of(garment)
@@ -276,7 +274,6 @@ def test_only_joints_that_it_does_not_know_can_be_told(first: Path, joints: tupl
         tell_of(network, joints, torch.zeros(3, 24, 3))
 
 
-@pytest.mark.usefixtures("no_curves")
 def test_learns_what_a_joint_does_that_it_was_not_told_of(first: Path, tmp_path: Path) -> None:
     """Shorts that a raised arm lifts."""
     garment = load_garment(GARMENT)
