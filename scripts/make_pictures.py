@@ -168,16 +168,18 @@ def draw_postures() -> None:
 
 
 def draw_legs() -> None:
-    """A skirt, without (above) and with the network that it has for legs apart or drawn up."""
+    """A skirt, without (above) and with the networks that it has for legs apart or drawn up, and for runners."""
     worn, size, columns = ("tshirt-female", "skirt-female"), (230, 230), []
     with TemporaryDirectory() as folder:
         for name in worn:
             shipped = ROOT / "refu_core" / "weights" / name
-            shutil.copytree(shipped, Path(folder) / name, ignore=shutil.ignore_patterns("legs.*"))
+            shutil.copytree(shipped, Path(folder) / name, ignore=shutil.ignore_patterns("legs.*", "heels.*"))
         pipelines = [GarmentPipeline.load(worn, weights=folder), GarmentPipeline.load(worn)]
-        for what in ("squat", "cross-legged", "straddle", "deep lunge", "side lunge", "high kick"):
+        ahead, behind = 25.0, 155.0
+        seen = dict.fromkeys(("squat", "cross-legged", "straddle", "deep lunge", "side lunge", "high kick"), ahead)
+        for what, yaw in (seen | dict.fromkeys(("running", "sprinting"), behind)).items():
             outputs = [pipeline(SmplFrame(pose=posture(what))) for pipeline in pipelines]
-            camera = Viewpoint.framing(outputs[1][worn[1]].local, size=size, yaw=25.0, pitch=8.0, margin=1.5)
+            camera = Viewpoint.framing(outputs[1][worn[1]].local, size=size, yaw=yaw, pitch=8.0, margin=1.5)
             scenes = [dressed(*pair) for pair in zip(pipelines, outputs, strict=True)]
             columns.append(np.concatenate([render(one, camera=camera, size=size, samples=9) for one in scenes]))
     save_jpeg(np.concatenate(columns, axis=1), "legs")

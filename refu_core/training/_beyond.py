@@ -16,7 +16,7 @@ from refu_core.garments import GarmentTemplate
 from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, seeded, start_parallel
 from refu_core.training._loss import code_loss
-from refu_core.training._rehearsal import Rehearsal
+from refu_core.training._rehearsal import Rehearsal, plans_of
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ def train_beyond(
     Args:
         kind: `lying`, `legs` for thighs that are apart or drawn up, or `heels` for lower legs raised behind.
         folder: holds tailornet-<mode> and its basis, which are left as they are.
-        rehearsal: bodies of the tailornet's plans. To those of them who are in such a posture nothing is added.
+        rehearsal: bodies of the tailornet's plans. To those of them who are in such a posture nothing is added. None is
+            needed if `datasets` are of all these plans.
         mode: mode of the tailornet; modes that share a basis share this, too.
     """
     if kind not in nets.KINDS:
@@ -80,9 +81,13 @@ def train_beyond(
     mean, components = data.principal_components(torch.cat((owed[0], -owed[0])), rank=settings.rank)
     decoder = nets.BasisDecoder(torch.zeros_like(mean), components)
     with seeded(settings.loop.seed):
-        beyond = nets.Beyond(kind, nets.BeyondConfig(known.config.joints), decoder)
-    rehearsed = rehearsal.of(card_of_known, known, known=opened.plans)
-    rehearsed = rehearsed.take(who(rehearsed.pose))
+        joints = tuple(dict.fromkeys((*known.config.joints, *nets.KINDS[kind].joints)))
+        beyond = nets.Beyond(kind, nets.BeyondConfig(joints), decoder)
+    if plans_of(card_of_known, known=()) and not plans_of(card_of_known, known=opened.plans):
+        rehearsed = train.take(torch.zeros(len(train), dtype=torch.bool))  # the truth of all of them is given
+    else:
+        rehearsed = rehearsal.of(card_of_known, known, known=opened.plans)
+        rehearsed = rehearsed.take(who(rehearsed.pose))
     owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
     parts = [
         (beyond.seen(one.betas, one.pose, one.style), decoder.encode(added))

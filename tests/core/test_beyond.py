@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from hypothesis import strategies as st
 from small_set import write_set
 from torch import Tensor
 
-from refu_core import GarmentPipeline, RefuError, Wearer, dress, load_body, load_garment
+import refu_core
+from refu_core import GarmentPipeline, RefuError, SmplFrame, Wearer, dress, load_body, load_garment
 from refu_core.backbones import (
     KINDS,
     BasisDecoder,
@@ -98,7 +100,7 @@ def with_knee(hip: float, knee: float) -> Tensor:
 
 
 @pytest.mark.parametrize(
-    ("hip", "knee", "share"), [(-20, 65, 0), (-85, 110, 0), (-98, 18, 0), (20, 60, 1), (-30, 120, 1), (5, 130, 1)]
+    ("hip", "knee", "share"), [(-20, 50, 0), (-85, 110, 0), (-98, 18, 0), (20, 70, 1), (-30, 120, 1), (5, 130, 1)]
 )
 def test_runners_raise_their_heels_and_who_walks_sits_or_kicks_does_not(hip: float, knee: float, share: int) -> None:
     assert float(heels_share(with_knee(hip, knee))) == share
@@ -137,6 +139,22 @@ def test_who_lies_wears_something_else_beside_who_stands() -> None:
     assert float(added[1:].mean(1).min()) > 0.002
     alone = torch.cat([both(betas[:1], one[None], None) for one in pose])
     torch.testing.assert_close(alone, both(betas, pose, None), rtol=0, atol=1e-5)
+
+
+def test_a_hem_lies_on_the_calf_of_who_runs(tmp_path: Path) -> None:
+    """The network is told of the knees, though the dress's backbone sees none."""
+    garment = "dress-female"
+    shipped = Path(refu_core.__file__).parent / "weights" / garment
+    shutil.copytree(shipped, tmp_path / garment, ignore=shutil.ignore_patterns("heels.*"))
+    pose = with_knee(-25, 115)[0].numpy()
+    without, with_it = (
+        GarmentPipeline.load([garment], sdf="none", **how)(SmplFrame(pose=pose))[garment].local
+        for how in ({"weights": tmp_path}, {})
+    )
+    is_lifted = with_it[:, 1] - without[:, 1] > 0.03
+    assert is_lifted.sum() > 50
+    assert with_it[is_lifted, 2].mean() < -0.05  # behind
+    assert with_it[is_lifted, 0].mean() < -0.02  # right
 
 
 def on_a_bed(pose: Tensor) -> Tensor:
