@@ -180,8 +180,8 @@ def test_what_motion_does_is_carried_over_too(made: Path) -> None:
 
 def test_where_joints_are_that_a_network_is_not_told_of_the_mean_stands_for() -> None:
     """A dress's network doesn't know where the knees are; a skirt's dynamics do."""
-    related, own = (load_backbone("dynamic", name) for name in ("skirt-female", "dress-female"))
-    related = getattr(related, "known", related)
+    worn = (load_backbone("dynamic", name) for name in ("skirt-female", "dress-female"))
+    related, own = (getattr(one, "known", one) for one in worn)
     draw = torch.Generator().manual_seed(0)
     betas, pose, past = (torch.randn(4, *shape, generator=draw) for shape in ((10,), (24, 3), (len(LAGS), N_PAST)))
     x, s = related.still.features(pose), style_shape(betas, None)
