@@ -24,8 +24,8 @@ class TrainOptions:
     network: str = setting(
         "garment",
         "sdf: the paper's network for the body's distance (preset paper or small); dynamics: what moving cloth does "
-        "beyond the tailornet of --mode in --output, from sequences; lying, or legs (apart or drawn up): what cloth "
-        "does beyond it in such postures",
+        "beyond the tailornet of --mode in --output, from sequences; lying, legs (apart or drawn up), heels "
+        "(raised behind): what cloth does beyond it in such postures",
         choices=("garment", "sdf", "dynamics", *BEYOND),
     )
     mode: str = setting(
