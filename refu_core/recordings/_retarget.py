@@ -72,6 +72,17 @@ class SourceSkeleton:
         """The joint that both sides of a point hang on, -1 if there is none."""
         return bearer_of(self.parents, self.points[f"l_{name}"], self.points[f"r_{name}"])
 
+    def at_rest(self, name: str) -> Array:
+        """The place between both sides of a point where no joint is turned (3,)."""
+        middle: Array = (self.rest[self.points[f"l_{name}"]] + self.rest[self.points[f"r_{name}"]]) / 2
+        return middle
+
+    def hangs_on(self, joint: int, above: int) -> bool:
+        """Whether a joint is another one, or turns with it."""
+        while joint not in (above, -1):
+            joint = self.parents[joint]
+        return joint == above
+
 
 def bearer_of(parents: Sequence[int], a: int, b: int) -> int:
     """The nearest joint that two joints hang on, -1 if there is none."""
@@ -135,16 +146,21 @@ class _Turned:
         along = source.middle("shoulder") - source.middle("hip")
         lefts = [_mean_in(turn, way) for turn, way in zip(turns, across, strict=True)]
         top = source.points.get("neck", source.points.get("head", chest))
-        low = (source.rest[source.points["l_hip"]] + source.rest[source.points["r_hip"]]) / 2
+        low = source.at_rest("hip")
         lower, upper = source.rest[chest] - low, source.rest[top] - source.rest[chest]
         up, is_straight = unit(lower + upper), top == chest or unit(lower) @ unit(upper) > _STRAIGHT
+        means = [(_mean_in(turn, along), upright) for turn in turns]
         if is_straight and np.abs(up).max() > _ALIGNED:
             up, upright = np.sign(up) * (np.abs(up) == np.abs(up).max()), np.array([0.0, 1.0, 0.0])
-        own = _axes(np.array([1.0, 0.0, 0.0]), upright)
-        ups = [up if is_straight else _mean_in(turn, along) for turn in turns]
-        trunk = [turn @ _axes(x, y) @ own.T for turn, x, y in zip(turns, lefts, ups, strict=True)]
+        # A spine that isn't borne by the hips' joint has to rest as people stand: with legs that hang.
+        of_hips = is_straight and (source.hangs_on(chest, pelvis) or (source.at_rest("knee") - low) @ up < 0)
+        ways = [(up, upright) if is_told else mean for is_told, mean in zip((of_hips, is_straight), means, strict=True)]
+        ahead = np.array([1.0, 0.0, 0.0])
+        own = _axes(ahead, upright)
+        trunk = [turn @ _axes(x, way) @ _axes(ahead, smpls).T
+                 for turn, x, (way, smpls) in zip(turns, lefts, ways, strict=True)]  # fmt: skip
         alike = [(axes[:, :, 0] * unit(way)).sum(1).mean() for axes, way in zip(trunk, across, strict=True)]
-        alike += [(axes @ own[:, 1] * unit(along)).sum(1).mean() for axes in trunk]
+        alike += [(axes @ smpls * unit(along)).sum(1).mean() for axes, (_, smpls) in zip(trunk, ways, strict=True)]
         if not min(alike) > _TURNED:
             return None
         faces_ahead = is_straight and lefts[0] @ lefts[1] > _ALIKE

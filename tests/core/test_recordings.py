@@ -340,10 +340,12 @@ def bvh(
     *,
     moved: Mapping[str, tuple[float, float, float]] | None = None,
     axes: NDArray[np.float64] | None = None,
+    hips: NDArray[np.float64] | None = None,
 ) -> tuple[str, NDArray[np.float64]]:
     """A file of the male body's skeleton, and its joints in metres, shape (n, 24, 3).
 
-    Joints at rest may be `moved` [m], and have `axes` (24, 3, 3) of their own.
+    Joints at rest may be `moved` [m], and have `axes` (24, 3, 3) of their own. Legs may hang on a joint of their own,
+    beside the spine; its axes are `hips` (3, 3).
     """
     body = load_body("male", dtype=torch.float64)
     rest = body.rest_joints(torch.zeros(1, 10, dtype=torch.float64))[0].numpy()
@@ -352,14 +354,26 @@ def bvh(
     own = np.broadcast_to(np.eye(3), (24, 3, 3)) if axes is None else axes
     lines, order = ["HIERARCHY"], []
 
+    def above(joint: int) -> NDArray[np.float64]:
+        """Axes of the joint that one hangs on."""
+        if joint in (1, 2) and hips is not None:
+            return hips
+        return own[PARENTS[joint]] if joint else np.eye(3)
+
     def add(joint: int) -> None:
         order.append(joint)
-        above = own[PARENTS[joint]] if joint else np.eye(3)
-        offset = above.T @ (unit * (rest[joint] - rest[max(PARENTS[joint], 0)]))
+        offset = above(joint).T @ (unit * (rest[joint] - rest[max(PARENTS[joint], 0)]))
         kind, channels = ("JOINT", "3") if joint else ("ROOT", "6 Xposition Yposition Zposition")
         lines.extend([f"{kind} {names[joint]}", "{", f"OFFSET {' '.join(map(str, offset))}"])
         lines.append(f"CHANNELS {channels} Zrotation Yrotation Xrotation")
         children = [i for i, parent in enumerate(PARENTS) if parent == joint]
+        if joint == 0 and hips is not None:
+            order.append(-1)
+            lines.extend(["JOINT Waist", "{", "OFFSET 0 0 0", "CHANNELS 3 Zrotation Yrotation Xrotation"])
+            add(1)
+            add(2)
+            lines.append("}")
+            children = [3]
         for child in children:
             add(child)
         if not children:
@@ -371,9 +385,11 @@ def bvh(
     for pose, transl in zip(POSES[:n], TRANSL[:n], strict=True):
         row = [*(unit * (transl + rest[0]))]
         for joint in order:
-            above = own[PARENTS[joint]] if joint else np.eye(3)
-            turn = Rotation.from_matrix(above.T @ Rotation.from_rotvec(pose[joint]).as_matrix() @ own[joint])
-            row += [*turn.as_euler("ZYX", degrees=True)]
+            if joint < 0:
+                matrix = own[0].T @ hips
+            else:
+                matrix = above(joint).T @ Rotation.from_rotvec(pose[joint]).as_matrix() @ own[joint]
+            row += [*Rotation.from_matrix(matrix).as_euler("ZYX", degrees=True)]
         lines.append(" ".join(f"{number:.6f}" for number in row))
     return "\n".join(lines), body(POSES[:n], transl=TRANSL[:n]).joints.numpy()
 
@@ -446,6 +462,19 @@ def world_turns(poses: NDArray[np.floating]) -> NDArray[np.float64]:
     for i in range(1, 24):
         turns[:, i] = turns[:, PARENTS[i]] @ turns[:, i]
     return turns
+
+
+@pytest.mark.parametrize(("pitch", "most"), [(0, 5), (-35, 12), (35, 12)])
+def test_bvh_whose_legs_and_spine_hang_side_by_side(tmp_path: Path, pitch: float, most: float) -> None:
+    """Where every bone has axes of its own, legs rise at rest; how the joint leans that bears them says nothing."""
+    axes = np.tile(np.eye(3), (24, 1, 1))
+    if pitch:
+        axes[[1, 2, 4, 5]] = np.diag([1.0, -1.0, -1.0])
+    text, _ = bvh(MIXAMO.split(), 100.0, axes=axes, hips=Rotation.from_euler("X", pitch, degrees=True).as_matrix())
+    (tmp_path / "a.bvh").write_text(text)
+    motion = read_motion(tmp_path / "a.bvh")
+    got, wanted = (Rotation.from_matrix(world_turns(poses)[:, 0]) for poses in (motion.poses, POSES[:8]))
+    assert np.degrees((got.inv() * wanted).magnitude()).max() < most
 
 
 def test_bvh_of_somebody_with_one_hand(tmp_path: Path) -> None:
