@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -33,6 +34,8 @@ def _hops() -> list[NDArray[np.intp]]:
 
 
 _HOPS = _hops()
+LIMBS = ((16, 18, 20, 22), (17, 19, 21, 23), (1, 4, 7, 10), (2, 5, 8, 11))
+"""The joints of arms and legs, from the trunk on."""
 _IDENTITY = np.eye(3)
 _CROSSES = np.stack([np.cross(axis, _IDENTITY).T.ravel() for axis in _IDENTITY])  # 3, 9: each axis as a skew matrix
 _NEARLY_HALF = -1.98  # twice the cosine of 172°
@@ -134,7 +137,22 @@ class Skeleton:
         """Joints that move a keypoint when they turn, shape (m,)."""
         self.carried = carried[:, self.turning]
         """Whether a keypoint moves (1) or not (0) when each of those joints turns, shape (K, m)."""
+        self.chains = [self._chain(limb) for limb in LIMBS]
+        """Of each of the `LIMBS`, the joints whose turn a keypoint shows, shape (n,), and the ends of those of their
+        bones about which they may turn without moving one, shape (n or n - 1,)."""
         self._last: tuple[Pose, Posed] | None = None
+
+    def _chain(self, limb: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        shown = {joint: {-1} for joint in limb}
+        for i, joint in enumerate(self.turning.tolist()):
+            shown[joint] = {-1, *np.flatnonzero(self.carried[:, i]).tolist()}
+        joints = [joint for joint in limb if len(shown[joint]) > 1]
+        ends = []
+        for joint, end in zip(joints, limb[1:], strict=False):
+            if shown[joint] != shown[end] | {self.layout.at_joint(end)}:
+                break
+            ends.append(end)
+        return np.array(joints), np.array(ends, dtype=np.intp)
 
     def bones(self, betas: Array) -> Array:
         """The vector from each joint's parent to it in the T-pose [m], shape (24, 3)."""
@@ -185,8 +203,9 @@ def log_so3(matrices: Array) -> Array:
     twice_sine = np.sqrt(np.einsum("ij,ij->i", vector, vector) + _TINY)
     twice_cosine = np.einsum("ijj->i", matrices) - 1
     result: Array = (np.arctan2(twice_sine, twice_cosine) / twice_sine)[:, None] * vector
-    for i in np.flatnonzero(twice_cosine < _NEARLY_HALF):  # near half a turn, where the sine vanishes
-        result[i] = Rotation.from_matrix(matrices[i]).as_rotvec()
+    near = twice_cosine < _NEARLY_HALF  # half a turn, where the sine vanishes
+    if near.any():
+        result[near] = Rotation.from_matrix(matrices[near]).as_rotvec()
     return result
 
 

@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.spatial.transform import Rotation
 
 from refu_core.frames import N_BETAS, N_JOINTS
-from refu_core.keypoints._pose import Array, Pose, Skeleton, exp_so3, log_so3, skew
+from refu_core.keypoints._pose import LIMBS, Array, Pose, Skeleton, exp_so3, log_so3, skew
 from refu_core.skeleton import JOINT_NAMES, PARENTS
 
 
@@ -266,9 +266,10 @@ def _inverse_right_jacobian(vectors: Array) -> Array:
 
 _TRUNK = (0, 1, 2, 3, 6, 9, 12, 13, 14, 15, 16, 17)
 """Joints that turn with the pelvis, more or less."""
-_LIMBS = ((16, 18, 20, 1.0), (17, 19, 21, 1.0), (1, 4, 7, -1.0), (2, 5, 8, -1.0))
-"""Ball, hinge, end; and which way along z a bending hinge moves the end in the T-pose: forearms forward, shins back."""
-_HINGED = np.array([limb[:2] for limb in _LIMBS])
+_BENDS = (1.0, 1.0, -1.0, -1.0)
+"""Which way along z the bending hinge of each of the `LIMBS` moves its end in the T-pose: forearms forward, shins
+back."""
+_HINGED = np.array(LIMBS)[:, :2]
 _LEAST = 0.05
 """Least length [m] of a vector that gives a direction; least half width of a trunk that shows which way it faces."""
 _BENT = 0.15
@@ -297,7 +298,7 @@ def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start
     bones = skeleton.bones(start.betas)
     pelvis = centre[1] + root @ (upright.pelvis - centre[0])
     world = skeleton.posed(Pose(pelvis, turns, start.betas)).turns
-    for ball, hinge, end, bends in _LIMBS:
+    for (ball, hinge, end, _), bends in zip(LIMBS, _BENDS, strict=True):
         at = [skeleton.layout.at_joint(joint) for joint in (ball, hinge, end)]
         if at[0] < 0 or at[1] < 0 or not (seen[at[0]] and seen[at[1]]):
             continue
@@ -316,25 +317,44 @@ def first_pose(skeleton: Skeleton, points: Array, seen: NDArray[np.bool_], start
     return Pose(pelvis, turns, start.betas)
 
 
-def twisted_wrongly(pose: Pose, bones: Array) -> list[tuple[int, int, Array]]:
-    """Limbs that would be far likelier if they were turned about their upper bone, which moves no keypoint.
+def twisted_wrongly(pose: Pose, skeleton: Skeleton) -> list[tuple[NDArray[np.intp], Array]]:
+    """Limbs that would be far likelier if they were turned about their own bones, which moves no keypoint.
 
     A straight arm doesn't show how it is turned; where that was guessed wrongly, its elbow bends the wrong way, and no
-    small step mends it. `bones` (24, 3) are as from `Skeleton.bones`. Returns ball, hinge, and the turn (3, 3) in the
-    ball's own axes, which the hinge has to undo.
+    small step mends it. No more does one where a thigh is turned by half a turn, and knee and foot against it.
+
+    Returns the joints of each (n,), and the turns about the bones that they carry (n, 3, 3), each in the joint's own
+    axes. The next joint undoes it.
     """
     wrong = []
     odds = _squared_deviations(_HINGED.ravel(), pose.turns[_HINGED.ravel()]).reshape(_HINGED.shape).sum(axis=1)
-    for ball, hinge in _HINGED[odds > _FAR_LIKELIER]:
-        axis = bones[hinge] / max(float(np.linalg.norm(bones[hinge])), _LEAST)
-        turns = exp_so3(_TURNS_ABOUT[:, None] * axis)
-        tried = np.stack([pose.turns[ball] @ turns, turns.swapaxes(1, 2) @ pose.turns[hinge]], axis=1)
-        joints = np.tile([ball, hinge], len(turns))
-        odds = _squared_deviations(joints, tried.reshape(-1, 3, 3)).reshape(-1, 2).sum(axis=1)
-        best = int(np.argmin(odds))
-        if odds[0] - odds[best] > _FAR_LIKELIER:
-            wrong.append((ball, hinge, turns[best]))
+    for i in np.flatnonzero(odds > _FAR_LIKELIER):
+        joints, ends = skeleton.chains[i]
+        bones = skeleton.bones(pose.betas)[ends]
+        axes = bones / np.maximum(np.linalg.norm(bones, axis=1), _LEAST)[:, None]
+        tried = [np.eye(3)[None], *(exp_so3(_TURNS_ABOUT[:, None] * axis) for axis in axes)]
+        tried += tried[:1] * (len(joints) - len(ends))
+        least, choices = np.zeros(1), []
+        for joint, above, own in zip(joints, tried, tried[1:], strict=False):
+            turned = above.swapaxes(1, 2)[:, None] @ pose.turns[joint] @ own
+            odds_of = _squared_deviations(np.full(turned[..., 0, 0].size, joint), turned.reshape(-1, 3, 3))
+            both = least[:, None] + odds_of.reshape(turned.shape[:2])
+            choices.append(both.argmin(axis=0))
+            least = both.min(axis=0)
+        if least.min() < _squared_deviations(joints, pose.turns[joints]).sum() - _FAR_LIKELIER:
+            best, about = int(least.argmin()), []
+            for own, choice in zip(reversed(tried[1:]), reversed(choices), strict=True):
+                about.append(own[best])
+                best = choice[best]
+            wrong.append((joints, np.stack(about[::-1])))
     return wrong
+
+
+def turned_about_bones(turns: Array, about: Array) -> Array:
+    """Turns of a limb's joints (n, 3, 3) after those `about` the bones that they carry (n, 3, 3)."""
+    above = np.concatenate([np.eye(3)[None], about[:-1]])
+    result: Array = above.swapaxes(1, 2) @ turns @ about
+    return result
 
 
 def _squared_deviations(joints: NDArray[np.intp], turns: Array) -> Array:

@@ -28,6 +28,7 @@ from refu_core.keypoints._solver import (
     Solver,
     TrackerSettings,
     first_pose,
+    turned_about_bones,
     twisted_wrongly,
 )
 from refu_core.skeleton import JOINT_NAMES
@@ -282,11 +283,11 @@ class KeypointTracker:
         self._learn_noise(seen, dt)
 
     def _untwist(self) -> None:
-        """Turns limbs that bend the wrong way about their upper bones, rates with them."""
-        for ball, hinge, turn in twisted_wrongly(self._pose, self.skeleton.bones(self._pose.betas)):
+        """Turns limbs about their bones where they bend the wrong way, rates with them."""
+        for joints, about in twisted_wrongly(self._pose, self.skeleton):
             turns, rates = self._pose.turns.copy(), self._rate[TURNS].reshape(N_JOINTS, 3)
-            turns[ball], turns[hinge] = turns[ball] @ turn, turn.T @ turns[hinge]
-            rates[ball] = turn.T @ rates[ball]
+            turns[joints] = turned_about_bones(turns[joints], about)
+            rates[joints] = np.einsum("jki,jk->ji", about, rates[joints])
             self._pose = Pose(self._pose.pelvis, turns, self._pose.betas)
 
     def _learn_noise(self, seen: _Seen, dt: float) -> None:
