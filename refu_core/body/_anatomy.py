@@ -99,7 +99,8 @@ class Anatomy:
         self.bones = self._bind_bones(rest, mesh, weights)
         self.seams = self._bind_seams(body)
         self.segments = self._bind_segments(rest, solids, weights)
-        self.thickness = torch.as_tensor(_thickness(rest, mesh, str(self.device)), device=self.device)
+        thickness = _thickness(rest, mesh, solids.of_vertex, str(self.device))
+        self.thickness = torch.as_tensor(thickness, device=self.device)
         """How far it is through the body from each vertex [m], shape (V,)."""
         self.farthest = self.thickness.mul(settings.thin).clamp(max=settings.farthest)
         """How far skin may be moved [m], shape (V,)."""
@@ -285,15 +286,27 @@ def _smooth_normals(vertices: NDArray[np.float64], mesh: Connectivity) -> NDArra
     return unit
 
 
+def _meets() -> NDArray[np.int32]:
+    """Whether segment i ends where segment k begins, or the other way round, or is it (1 or 0), shape (K, K)."""
+    of_joint = {joint: k for k, (joints, _) in enumerate(SOFTNESS) for joint in joints}
+    meets = np.eye(len(SOFTNESS), dtype=np.int32)
+    for joint, above in enumerate(PARENTS[1:], start=1):
+        meets[of_joint[joint], of_joint[above]] = meets[of_joint[above], of_joint[joint]] = 1
+    return meets
+
+
 @remembered(4)
-def _thickness(rest: NDArray[np.float64], mesh: Connectivity, device: str) -> NDArray[np.float32]:
+def _thickness(
+    rest: NDArray[np.float64], mesh: Connectivity, of_vertex: NDArray[np.int32], device: str
+) -> NDArray[np.float32]:
     """Distance to the skin on the other side [m], the least over each vertex and its neighbours, shape (V,)."""
     points, normals = (
         wp.array(one.astype(np.float32), dtype=wp.vec3, device=device) for one in (rest, _smooth_normals(rest, mesh))
     )
     body = wp.Mesh(points, ints(mesh.faces.ravel(), device))
+    of = [wp.array(one, dtype=wp.int32, device=device) for one in (mesh.faces, of_vertex, _meets())]
     across = wp.zeros(len(rest), dtype=wp.float32, device=device)
-    wp.launch(parting.thickness_kernel, len(rest), [body.id, points, normals, across], device=device)
+    wp.launch(parting.thickness_kernel, len(rest), [body.id, points, normals, *of, across], device=device)
     found = across.numpy()
     least: NDArray[np.float32] = found.copy()
     np.minimum.at(least, mesh.ring.owner, found[mesh.ring.items])

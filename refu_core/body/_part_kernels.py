@@ -332,14 +332,31 @@ def closest_kernel(
 
 @wp.kernel
 def thickness_kernel(
-    body: wp.uint64, points: wp.array[wp.vec3], normal: wp.array[wp.vec3], thickness: wp.array[float]
+    body: wp.uint64,
+    points: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    face: wp.array2d[int],
+    own: wp.array[int],
+    meets: wp.array2d[int],
+    # outputs
+    thickness: wp.array[float],
 ) -> None:
-    """Finds how far it is from each vertex to the skin on the other side [m]."""
+    """Finds how far it is from each vertex to the skin on the other side [m], that of a segment that `meets` its own.
+
+    Where thighs touch at rest, the first skin that is met is the other thigh's.
+    """
     v = wp.tid()
-    thickness[v] = DEEPEST
-    hit = wp.mesh_query_ray(body, points[v] - 1.0e-4 * normal[v], -normal[v], DEEPEST)
-    if hit.result:
-        thickness[v] = hit.t
+    start = float(1.0e-4)
+    found = float(DEEPEST)
+    while start < DEEPEST:
+        hit = wp.mesh_query_ray(body, points[v] - start * normal[v], -normal[v], DEEPEST)
+        if not hit.result:
+            break
+        if meets[own[v], own[face[hit.face, 0]]] == 1:
+            found = (start - 1.0e-4) + hit.t
+            break
+        start += hit.t + 1.0e-4
+    thickness[v] = wp.min(found, DEEPEST)
 
 
 @wp.kernel

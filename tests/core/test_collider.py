@@ -356,6 +356,17 @@ def test_a_body_of_another_topology(body: SmplBody) -> None:
     assert len(seen.detect(skin.vertices[0]).pairs) > 10 > len(seen.detect(apart[0]).pairs)
 
 
+def test_thighs_that_touch_at_rest_are_as_thick_as_others(body: SmplBody, collider: Collider) -> None:
+    """As SMPL's do. They were taken to be as thin as they overlap, and no skin moves by more than a share of that."""
+    closed = body(pose=posed(body, {"left_hip": (0, 0, -0.28), "right_hip": (0, 0, 0.28)}))
+    touching = _replaced(body, v_template=closed.vertices[0].numpy())
+    left = touching.weights.argmax(1) == 1
+    assert touching.v_template[left, 0].min() < -5 * MM
+    thighs = touching.weights[:, 1:3].sum(1) > 0.99
+    thickness = Collider(touching).anatomy.thickness
+    assert (thickness / collider.anatomy.thickness)[thighs].min() > 0.9
+
+
 def test_an_open_body_is_refused(body: SmplBody) -> None:
     open_body = _replaced(body, f=body.faces.numpy()[1:])
     with pytest.raises(MeshError, match="watertight"):
