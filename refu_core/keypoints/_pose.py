@@ -138,8 +138,8 @@ class Skeleton:
         self.carried = carried[:, self.turning]
         """Whether a keypoint moves (1) or not (0) when each of those joints turns, shape (K, m)."""
         self.chains = [self._chain(limb) for limb in LIMBS]
-        """Of each of the `LIMBS`, the joints whose turn a keypoint shows, shape (n,), and the ends of those of their
-        bones about which they may turn without moving one, shape (n or n - 1,)."""
+        """Of each of the `LIMBS`, the joints that move a keypoint, shape (n,), and the ends of their bones, from the
+        first one on, about which they may turn without moving any, shape (m,), m ≤ n."""
         self._last: tuple[Pose, Posed] | None = None
 
     def _chain(self, limb: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -2,7 +2,8 @@
 
 Tools put a pelvis between the hips or a hand's breadth above them, a neck between the shoulders or under the skull, and
 make trunks longer or shorter than SMPL's. Fitted by the places of such joints, SMPL's spine bends by up to 80° in
-somebody who stands. What turns with a joint is sure, and so is which way is up in the rest pose: along the spine.
+somebody who stands. What turns with a joint is sure, and so is which way is up in the rest pose: along the spine, if
+hips and spine turn together there.
 """
 
 from __future__ import annotations
