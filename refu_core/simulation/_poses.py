@@ -224,6 +224,13 @@ POSTURES = {
     "heel at the seat": "left_hip 4 0 2, left_knee 124 0 0, both_shoulder 18 -16 -83, both_elbow 0 -9 0",
     "sitting on the heels": "both_hip -78 0 6, both_knee 142 0 0, both_ankle 30 0 0, both_shoulder 17 -35 -76, "
     "both_elbow 0 -50 0",
+    "leg behind": "pelvis 40 0 0, spine1 -14 0 0, spine2 -14 0 0, spine3 -10 0 0, left_hip 42 15 12, left_knee 12 0 0, "
+    "right_hip -40 0 0, both_shoulder 0 -40 -20, both_elbow 0 -15 0",
+    "leg to the side": "pelvis 0 0 -8, left_hip -22 35 72, left_knee 8 0 0, right_hip 0 0 8, both_shoulder 0 -20 -25, "
+    "both_elbow 0 -20 0",
+    "foot at the knee": "left_hip -62 48 48, left_knee 118 0 0, both_shoulder 0 -35 -40, both_elbow 0 -35 0",
+    "bent knees turned out": "both_hip -55 48 42, both_knee 98 0 0, both_ankle -22 0 0, both_shoulder 0 -25 -40, "
+    "both_elbow 0 -25 0",
 }
 """By name: rotation vectors [degrees] in SMPL's axes, x to the left, as `refu_core.skeleton.posed` reads them."""
 SELF_TOUCHING = tuple(POSTURES)[:8]

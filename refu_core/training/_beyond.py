@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, seeded, start_parallel
 from refu_core.training._loss import code_loss
 from refu_core.training._rehearsal import Rehearsal, plans_of
+from refu_core.weights import load_weights
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,17 @@ def train_beyond(
 ) -> dict[str, Any]:
     """Trains what is added to the garment's tailornet in `folder` in postures of a kind, and writes `folder`/<kind>.
 
-    Samples in other postures are left out. All else, and what is returned, is as in `pretrain`; figures stand beside
+    Samples in other postures are left out. A network of that kind which is in `folder` already is gone on with: what it
+    adds to people of its plans is rehearsed. All else, and what is returned, is as in `pretrain`; figures stand beside
     those of the tailornet alone. Raises `RefuError` as that does, for no such kind, and for too few people in such
     postures to learn from or test on; `WeightsError` for no tailornet there, or a damaged one.
 
     Args:
         kind: `lying`, `legs` for thighs that are apart or drawn up, or `heels` for lower legs raised behind.
         folder: holds tailornet-<mode> and its basis, which are left as they are.
-        rehearsal: bodies of the tailornet's plans. To those of them who are in such a posture nothing is added. None is
-            needed if `datasets` are of all these plans.
+        rehearsal: bodies of the tailornet's plans, and of those of a network that is gone on with. To those of them who
+            are in such a posture nothing is added, or what that network adds. None is needed if `datasets` are of all
+            these plans.
         mode: mode of the tailornet; modes that share a basis share this, too.
     """
     if kind not in nets.KINDS:
@@ -83,12 +87,20 @@ def train_beyond(
     with seeded(settings.loop.seed):
         joints = tuple(dict.fromkeys((*known.config.joints, *nets.KINDS[kind].joints)))
         beyond = nets.Beyond(kind, nets.BeyondConfig(joints), decoder)
-    if plans_of(card_of_known, known=()) and not plans_of(card_of_known, known=opened.plans):
-        rehearsed = train.take(torch.zeros(len(train), dtype=torch.bool))  # the truth of all of them is given
-    else:
-        rehearsed = rehearsal.of(card_of_known, known, known=opened.plans)
+    earlier, its_card = _earlier(kind, template, folder, mode)
+    its_plans = plans_of(its_card, known=opened.plans)
+    plans = [*plans_of(card_of_known, known=opened.plans), *its_plans]
+
+    def added(betas: Tensor, pose: Tensor, style: Tensor) -> Tensor:
+        if earlier is None:
+            return torch.zeros(len(pose), template.n_vertices, 3)
+        return earlier.decoder(earlier(earlier.seen(betas, pose, style)))
+
+    rehearsed = train.take(torch.zeros(len(train), dtype=torch.bool))
+    if plans or not plans_of(card_of_known, known=()):
+        rehearsed = rehearsal.of({**opened.identity, "datasets": [{"plan": plan} for plan in plans]}, added)
         rehearsed = rehearsed.take(who(rehearsed.pose))
-    owed[0] = torch.cat((owed[0], torch.zeros_like(rehearsed.displacement)))
+    owed[0] = torch.cat((owed[0], rehearsed.displacement))
     parts = [
         (beyond.seen(one.betas, one.pose, one.style), decoder.encode(added))
         for one, added in zip((train.joined(rehearsed), validation), owed, strict=True)
@@ -100,7 +112,7 @@ def train_beyond(
         "tailornet_sha256": card_of_known["sha256"],
         "settings": asdict(settings),
         "samples": len(train),
-        "rehearsed": len(rehearsed),
+        "rehearsed": {"count": len(rehearsed), "plans": its_plans},
     }
     loop = Loop(beyond, settings.loop, folder / kind, [described, asdict(beyond.config)], torch_device, quiet=quiet)
     loop.run(TrainingStage(kind, Objective([beyond], beyond, code_loss(beyond)), settings.steps, *parts))
@@ -112,3 +124,15 @@ def train_beyond(
         nets.save_beyond(folder, beyond, card)
         loop.checkpoint.unlink(missing_ok=True)
     return card
+
+
+def _earlier(
+    kind: str, garment: GarmentTemplate, folder: Path, mode: str
+) -> tuple[nets.Beyond | None, Mapping[str, Any]]:
+    """The network of a kind that is in a folder already, and its card; None and an empty card if there is none."""
+    if not (folder / f"{kind}.json").exists():
+        return None, {}
+    both = nets.load_backbone("tailornet", garment, mode=mode, folder=folder)
+    assert isinstance(both, nets.WithBeyond)  # there is one
+    found = {one.kind: one for one in both.beyond if isinstance(one, nets.Beyond)}[kind]
+    return found, load_weights(folder / kind).card

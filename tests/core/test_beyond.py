@@ -41,6 +41,7 @@ from refu_lab.commands.train import BEYOND
 pytestmark = pytest.mark.usefixtures("no_curves_in_module")
 GARMENT = "tshirt-male"
 OWN = "short-pant-male"
+LYING = ("lying on the back", "lying on the belly", "lying on the side")
 
 
 def tilted(degrees: float, *, about: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> Tensor:
@@ -181,6 +182,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def planned(source: Path, folder: Path, seed: int) -> tuple[Path, SamplePlan]:
+    """A copy of a set as if it were of a plan of people who lie, and that plan."""
+    card = json.loads((source / "card.json").read_text())
+    plan = SamplePlan(OWN, card["plan"]["count"], seed=seed, recorded_share=0.0, posture_share=1.0, postures=LYING)
+    shutil.copytree(source, folder)
+    (folder / "card.json").write_text(json.dumps(card | {"plan": asdict(plan)}))
+    return folder, plan
+
+
 def test_it_learns_what_a_backbone_cannot_know_and_comes_back_from_its_file(folder: Path) -> None:
     settings = BeyondSettings(LoopSettings(batch_size=32, learning_rate=3e-3), steps=500)
     how: dict[str, Any] = {"mode": "none", "rehearsal": Rehearsal(30), "settings": settings}
@@ -192,8 +202,46 @@ def test_it_learns_what_a_backbone_cannot_know_and_comes_back_from_its_file(fold
     off = (both(torch.zeros(2, 10), pose, None) - both.known(torch.zeros(2, 10), pose, None)).norm(dim=-1).mean(1)
     assert off[0] == 0
     assert float(off[1]) > 0.005
+    assert card["rehearsed"] == {"count": 0, "plans": []}  # of those plans nobody lies
+    (folder / "weights" / "lying.json").unlink()
     again = train_beyond("lying", OWN, folder / "lying", folder / "weights", **how)
     assert again["figures"] == card["figures"]
+
+
+def test_it_is_gone_on_with(folder: Path, tmp_path: Path) -> None:
+    """What was learnt from a set that isn't there any more is rehearsed, beside the few people of a new one."""
+    weights, garment = tmp_path / "weights", load_garment(OWN)
+    shutil.copytree(folder / "weights", weights, ignore=shutil.ignore_patterns("lying.*"))
+    write_set(tmp_path / "bare", garment, load_body(garment.body), pairs=6, poses=4, test_pairs=2, spread=0.8, turn=1.3)
+    lost, plan = planned(folder / "lying", tmp_path / "lost", 1)
+    later, _ = planned(tmp_path / "bare", tmp_path / "later", 2)
+    settings = BeyondSettings(LoopSettings(batch_size=32, learning_rate=3e-3), steps=300)
+    how: dict[str, Any] = {"mode": "none", "rehearsal": Rehearsal(300), "settings": settings}
+
+    def added() -> Tensor:
+        both = load_backbone("tailornet", OWN, mode="none", folder=weights)
+        assert isinstance(both, WithBeyond)
+        given = torch.zeros(1, 10), tilted(-90), None
+        return both(*given) - both.known(*given)
+
+    train_beyond("lying", OWN, lost, weights, **how)
+    before = added()
+    card = train_beyond("lying", OWN, later, weights, **how)
+    assert json.loads(json.dumps(asdict(plan))) in json.loads(json.dumps(card["rehearsed"]["plans"]))
+    assert card["rehearsed"]["count"] > 100
+    off = (added() - before).norm()
+    (weights / "lying.json").unlink()
+    train_beyond("lying", OWN, later, weights, **how)
+    assert off < 0.5 * (added() - before).norm()
+
+
+def test_nothing_is_rehearsed_where_all_plans_are_known(folder: Path, tmp_path: Path) -> None:
+    weights = tmp_path / "weights"
+    shutil.copytree(folder / "weights", weights, ignore=shutil.ignore_patterns("lying.*"))
+    lying, _ = planned(folder / "lying", tmp_path / "lying", 1)
+    how: dict[str, Any] = {"mode": "none", "settings": BeyondSettings(LoopSettings(batch_size=32), steps=2)}
+    card = train_beyond("lying", OWN, [folder / "standing", lying], weights, rehearsal=Rehearsal(0), **how)
+    assert card["rehearsed"] == {"count": 0, "plans": []}
 
 
 def test_nobody_lies_in_a_set_of_people_who_stand(folder: Path) -> None:
