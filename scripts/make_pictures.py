@@ -161,9 +161,10 @@ def draw_collider() -> None:
 
 
 def draw_postures() -> None:
-    """Everyday postures, dressed; rows of eleven."""
-    names, size = tuple(POSTURES), (150, 180)
-    rows = [collider_sheet(poses=names[i : i + 11], size=size, samples=4)[-180:] for i in range(0, len(names), 11)]
+    """Everyday postures, dressed; rows of thirteen, the last one filled up in white."""
+    names, size, n = tuple(POSTURES), (150, 180), 13
+    rows = [collider_sheet(poses=names[i : i + n], size=size, samples=4)[-180:] for i in range(0, len(names), n)]
+    rows[-1] = np.pad(rows[-1], ((0, 0), (0, n * 150 - rows[-1].shape[1]), (0, 0)), constant_values=255)
     save_jpeg(np.concatenate(rows), "postures")
 
 

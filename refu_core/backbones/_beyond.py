@@ -27,6 +27,8 @@ APART = (math.cos(math.radians(85)), math.cos(math.radians(110)))
 """Cosines of the angles between the thighs; recorded ones are at 78° at most."""
 DRAWN_UP = (math.cos(math.radians(100)), math.cos(math.radians(120)))
 """Cosines of the angle by which a thigh is drawn up: in a chair it is 90°, in a squat 120°."""
+DRAWN_BACK = (math.sin(math.radians(25)), math.sin(math.radians(50)))
+"""Sines of the angle by which a thigh points backwards; recorded ones do by 24.5° at most."""
 RAISED = (math.cos(math.radians(35)), math.cos(math.radians(85)))
 """Cosines of the angle by which a lower leg is raised: who walks raises it by 50°, who runs by 90° and more.
 Faded in from 50° to 75°, a runner's dress jumped more often: before contact, a vertex went 20 mm farther than the
@@ -48,7 +50,7 @@ def lying_share(pose: Tensor) -> Tensor:
 
 
 def legs_share(pose: Tensor) -> Tensor:
-    """How much some people (B, 24, 3) [rad] have their thighs apart or drawn up, 0 to 1, shape (B,).
+    """How much some people (B, 24, 3) [rad] have their thighs apart, drawn up or drawn back, 0 to 1, shape (B,).
 
     None of it is left of somebody who lies.
     """
@@ -56,13 +58,15 @@ def legs_share(pose: Tensor) -> Tensor:
     left, right = thighs.unbind(1)
     sideways, apart = _faded(right[:, 0] - left[:, 0], SIDEWAYS), _faded((left * right).sum(1), APART)
     drawn_up = _faded(thighs[..., 1].amin(1), DRAWN_UP)
-    return (1 - (1 - sideways) * (1 - apart) * (1 - drawn_up)) * (1 - lying_share(pose))
+    drawn_back = _faded(thighs[..., 2].amax(1), DRAWN_BACK)
+    others = (1 - sideways) * (1 - apart) * (1 - drawn_up) * (1 - drawn_back)
+    return (1 - others) * (1 - lying_share(pose))
 
 
 def heels_share(pose: Tensor) -> Tensor:
     """How much some people (B, 24, 3) [rad] have a lower leg raised behind them, 0 to 1, shape (B,).
 
-    None of it is left of somebody who lies, or whose legs are apart or drawn up.
+    None of it is left of somebody who lies, or whose thighs are apart or drawn up or back.
     """
     thighs, knees = rotvec_to_rotmat(pose[:, 1:3]), rotvec_to_rotmat(pose[:, 4:6])
     legs = (thighs @ knees[..., 1:2])[..., 0]  # where lower legs point, turned round
@@ -96,8 +100,9 @@ def _lies_flat(pose: Sequence[Sequence[float]]) -> bool:
 def _stretches_legs(pose: Sequence[Sequence[float]]) -> bool:
     left, right = map(_turned, pose[1:3])
     between = sum(one * other for one, other in zip(left, right, strict=True))
-    is_apart = right[0] - left[0] > SIDEWAYS[0] or between < APART[0] or min(left[1], right[1]) < DRAWN_UP[0]
-    return is_apart and not _lies_flat(pose)
+    is_apart = right[0] - left[0] > SIDEWAYS[0] or between < APART[0]
+    is_drawn = min(left[1], right[1]) < DRAWN_UP[0] or max(left[2], right[2]) > DRAWN_BACK[0]
+    return (is_apart or is_drawn) and not _lies_flat(pose)
 
 
 def _raises_heels(pose: Sequence[Sequence[float]]) -> bool:

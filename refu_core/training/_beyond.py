@@ -55,7 +55,7 @@ def train_beyond(
     postures to learn from or test on; `WeightsError` for no tailornet there, or a damaged one.
 
     Args:
-        kind: `lying`, `legs` for thighs that are apart or drawn up, or `heels` for lower legs raised behind.
+        kind: `lying`, `legs` for thighs apart or drawn up or back, or `heels` for lower legs raised behind.
         folder: holds tailornet-<mode> and its basis, which are left as they are.
         rehearsal: bodies of the tailornet's plans, and of those of a network that is gone on with. To those of them who
             are in such a posture nothing is added, or what that network adds. None is needed if `datasets` are of all

@@ -24,7 +24,7 @@ class TrainOptions:
     network: str = setting(
         "garment",
         "sdf: the paper's network for the body's distance (preset paper or small); dynamics: what moving cloth does "
-        "beyond the tailornet of --mode in --output, from sequences; lying, legs (apart or drawn up), heels "
+        "beyond the tailornet of --mode in --output, from sequences; lying, legs (apart or drawn up or back), heels "
         "(raised behind): what cloth does beyond it in such postures",
         choices=("garment", "sdf", "dynamics", *BEYOND),
     )

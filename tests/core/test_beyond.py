@@ -33,7 +33,8 @@ from refu_core.backbones import (
     up_in_root,
 )
 from refu_core.errors import WeightsError
-from refu_core.simulation import SamplePlan
+from refu_core.sdf import ExactSdf
+from refu_core.simulation import SamplePlan, posture
 from refu_core.training import BeyondSettings, LoopSettings, PretrainSettings, Rehearsal, pretrain, train_beyond
 from refu_core.weights import load_weights
 from refu_lab.commands.train import BEYOND
@@ -113,6 +114,14 @@ def test_heels_are_faded_in_without_a_step(hip: float, knee: float) -> None:
     assert abs(here - there) < 0.06
 
 
+@given(st.floats(-120, 60))
+def test_thighs_drawn_up_or_back_are_faded_in_without_a_step(hip: float) -> None:
+    here, there = (float(legs_share(with_legs((one, 0, 0), (0, 0, 0)))) for one in (hip, hip + 0.5))
+    assert abs(here - there) < 0.06
+    assert here == (0 if -85 <= hip <= 25 else here)
+    assert here == (1 if hip >= 50.1 else here)
+
+
 def test_who_lies_with_legs_apart_lies() -> None:
     pose = with_legs((0, 0, 50), (0, 0, -50))
     assert float(legs_share(pose)) == 1
@@ -156,6 +165,21 @@ def test_a_hem_lies_on_the_calf_of_who_runs(tmp_path: Path) -> None:
     assert is_lifted.sum() > 50
     assert with_it[is_lifted, 2].mean() < -0.05  # behind
     assert with_it[is_lifted, 0].mean() < -0.02  # right
+
+
+@pytest.mark.parametrize("name", ["side lunge", "leg behind", "leg to the side", "bent knees turned out"])
+@pytest.mark.parametrize("garment", ["dress-female", "skirt-female"])
+def test_thighs_are_less_deep_in_loose_cloth(garment: str, name: str, tmp_path: Path) -> None:
+    shipped = Path(refu_core.__file__).parent / "weights" / garment
+    shutil.copytree(shipped, tmp_path / garment, ignore=shutil.ignore_patterns("legs.*"))
+    depth = []
+    for how in ({"weights": tmp_path}, {}):
+        pipeline = GarmentPipeline.load([garment], sdf="none", **how)
+        output = pipeline(SmplFrame(pose=posture(name)))
+        sdf = ExactSdf(pipeline.body.faces)
+        sdf.update(torch.tensor(output.body))
+        depth.append(float((-sdf.query(torch.tensor(output[garment].local)).distance).clamp(min=0).mean()))
+    assert depth[1] < 0.7 * depth[0]
 
 
 def on_a_bed(pose: Tensor) -> Tensor:
