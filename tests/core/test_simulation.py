@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import errno
-import importlib.util
 import json
 import multiprocessing
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from functools import cache, partial
@@ -22,6 +20,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loaded import load_script
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -135,14 +134,7 @@ def fcl_pairs(first: NDArray[Any], first_faces: NDArray[Any], second: NDArray[An
 @pytest.fixture(scope="module")
 def verifier() -> Any:
     """The script that judges whole sets."""
-    path = Path(refu_core.__file__).parents[1] / "scripts" / "verify_dataset.py"
-    spec = importlib.util.spec_from_file_location("verify_dataset", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script("scripts/verify_dataset.py")
 
 
 def test_nothing_collides_by_three_judges(verifier: Any, simulated: Path, samples: list[GarmentSample]) -> None:

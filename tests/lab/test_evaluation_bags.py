@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loaded import load_script
 from rosbags.rosbag2 import Reader as RosbagsReader
 
 import msg_adapters as adapters
@@ -73,13 +72,7 @@ def test_shipped_truth_is_that_of_its_frames(bag: Path) -> None:
 
 @pytest.fixture(scope="module")
 def script() -> Any:
-    spec = importlib.util.spec_from_file_location("make_evaluation_bags", BAGS / "make_evaluation_bags.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script("bags/make_evaluation_bags.py")
 
 
 def card(kind: str) -> dict[str, Any]:
