@@ -292,28 +292,28 @@ def _own_tensors(network: Module, *, exact: bool = False) -> tuple[dict[str, Ten
     return short, [k for k in state if k in learnt and learnt[k].ndim > 1]
 
 
-def with_beyond(network: Backbone, weights: Weights) -> Backbone:
-    """A backbone made from `weights`, with the networks for further postures that are beside those of a tailornet.
+def with_beyond(network: Backbone, weights: Weights, garment: GarmentTemplate) -> Backbone:
+    """A garment's backbone made from `weights`, with the networks for further postures that are beside a tailornet's.
 
     Raises `WeightsError`: one is damaged, or made for another basis.
     """
     kinds = [kind for kind in KINDS if weights.path.with_name(f"{kind}.json").exists()]
     if weights.card.get("backbone") != "tailornet" or not kinds:
         return network
-    n = getattr(network, "decoder").n_vertices  # noqa: B009 - a trained one has it
     device = next(network.parameters()).device if isinstance(network, Module) else "cpu"
-    beyond = [_load_beyond(kind, weights, n).to(device) for kind in kinds]
+    beyond = [_load_beyond(kind, weights, garment).to(device) for kind in kinds]
     return WithBeyond(network, beyond).eval().requires_grad_(False)
 
 
-def _load_beyond(kind: str, weights: Weights, n_vertices: int) -> Beyond:
+def _load_beyond(kind: str, weights: Weights, garment: GarmentTemplate) -> Beyond:
     stored = _load_beside(weights, kind)
     tensors = {k: v for k, v in stored.tensors.items() if not k.startswith(_BASIS)}
     with naming(stored.path):
         config = config_of_card(BeyondConfig, stored.card.get("config"))
-        decoder = BasisDecoder.of_tensors({k[len(_BASIS) :]: v for k, v in stored.tensors.items() if k not in tensors})
-        if decoder.n_vertices != n_vertices:
-            raise WeightsError(f"wanted {n_vertices} vertices, got {decoder.n_vertices}; train it again")
+        basis = {k[len(_BASIS) :]: v for k, v in stored.tensors.items() if k not in tensors}
+        decoder = BasisDecoder.of_tensors(basis, garment)
+        if decoder.n_vertices != garment.n_vertices:
+            raise WeightsError(f"wanted {garment.n_vertices} vertices, got {decoder.n_vertices}; train it again")
         return build_for(tensors, lambda: Beyond(kind, config, decoder), shared="decoder.")
 
 
@@ -332,7 +332,7 @@ def load_backbone(
     if weights is None:
         return Skinned()
     network = backbone_from_weights(weights, template).requires_grad_(False)
-    return with_beyond(with_dynamics(name, network, weights), weights)
+    return with_beyond(with_dynamics(name, network, weights), weights, template)
 
 
 def backbone_weights(name: str, garment: str, *, mode: str, folder: Path | None = None) -> Weights | None:

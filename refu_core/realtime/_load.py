@@ -108,7 +108,7 @@ def wearable_of(
             f"{hint}train some with `refu train {template.name} --body`"
         )
         raise WeightsError(msg)
-    network = with_beyond(with_dynamics(backbone, network, stored), stored)
+    network = with_beyond(with_dynamics(backbone, network, stored), stored, template)
     margin = DEFAULT_MARGIN if refu is None else refu.margin
     feels_arms = all(joint in template.card.joints for arm in ARMS for joint in arm[:2])  # shoulders and elbows
     return Wearable(worn, network, refu, margin, betas, size, feels_arms and stored.card.get("knows_limbs") is True)

@@ -82,8 +82,13 @@ def train_beyond(
     train = data.with_mirrored(train, data.Mirror.of(template))
     owed = [one.displacement - data.displacements(known, one) for one in (train, validation)]
     # With both signs the mean is zero, so that nothing can be added.
-    mean, components = data.principal_components(torch.cat((owed[0], -owed[0])), rank=settings.rank)
-    decoder = nets.BasisDecoder(torch.zeros_like(mean), components)
+    both = torch.cat((owed[0], -owed[0]))
+    controls = known.decoder.controls if isinstance(known.decoder, nets.BasisDecoder) else None
+    if controls is None:
+        mean, components = data.principal_components(both, rank=settings.rank)
+    else:
+        mean, components = data.smooth_components(both, controls, rank=settings.rank)
+    decoder = nets.BasisDecoder(torch.zeros_like(mean), components, controls=controls)
     with seeded(settings.loop.seed):
         joints = tuple(dict.fromkeys((*known.config.joints, *nets.KINDS[kind].joints)))
         beyond = nets.Beyond(kind, nets.BeyondConfig(joints), decoder)
@@ -117,8 +122,8 @@ def train_beyond(
     loop = Loop(beyond, settings.loop, folder / kind, [described, asdict(beyond.config)], torch_device, quiet=quiet)
     loop.run(TrainingStage(kind, Objective([beyond], beyond, code_loss(beyond)), settings.steps, *parts))
     beyond.to("cpu").eval()
-    both: dict[str, nets.Backbone] = {"mpve_mm": nets.WithBeyond(known, [beyond]), "without_mm": known}
-    figures = {name: data.mpve(data.displacements(one, test), test, body, template) for name, one in both.items()}
+    networks: dict[str, nets.Backbone] = {"mpve_mm": nets.WithBeyond(known, [beyond]), "without_mm": known}
+    figures = {name: data.mpve(data.displacements(one, test), test, body, template) for name, one in networks.items()}
     card = {**described, "datasets": opened.cards, "figures": {"samples": len(test), **figures}}
     if is_writer():
         nets.save_beyond(folder, beyond, card)

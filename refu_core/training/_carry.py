@@ -157,7 +157,8 @@ def carry_over(
     drawn = _bodies(opened.samples, settings)
     # As many of each: the folds of the samples need components of their own.
     there = share * carried(*(values[: len(samples)] for values in drawn))
-    basis = _smooth_basis(torch.cat((samples.displacement, there)), controls, settings.rank)
+    both = torch.cat((samples.displacement, there))
+    basis = nets.BasisDecoder(*data.smooth_components(both, controls, rank=settings.rank), controls=controls)
     described = {**opened.identity, "samples": len(samples), "simulated": len(opened.samples), "like": like}
     nets.save_basis(output, basis, {**described, "set": opened.n_slots})
 
@@ -231,17 +232,6 @@ def borne_out(carried: Tensor, truth: Tensor, controls: nets.Controls) -> Tensor
     near = field.clamp_min(0).T / field.clamp_min(0).sum(0)[:, None]
     least = _DOUBT * own.mean() + torch.finfo(own.dtype).tiny
     return (field @ ((near @ common) / (near @ own + least))).clamp(0, 1)
-
-
-def _smooth_basis(displacement: Tensor, controls: nets.Controls, rank: int) -> nets.BasisDecoder:
-    """The output basis of displacements (N, V, 3) [m], limited to fields that `controls` can represent."""
-    field = controls.matrix()
-    smooth, triangle = torch.linalg.qr(field)
-    at = torch.einsum("vc,nvk->nck", smooth, displacement)
-    mean, components = data.principal_components(at, rank=rank)  # orthonormal columns: as over all vertices
-    both = torch.cat((mean.flatten()[None], components)).view(-1, *mean.shape)
-    mean, components = torch.linalg.solve_triangular(triangle, both, upper=True).flatten(1).tensor_split((1,))
-    return nets.BasisDecoder(mean.view(-1, 3), components, controls=controls)
 
 
 def _bodies(samples: data.TrainingSamples, settings: CarrySettings) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from refu_core.backbones import Backbone, BasisDecoder, TailorNet, backbone_from_weights, style_shape
+from refu_core.backbones import Backbone, BasisDecoder, Controls, TailorNet, backbone_from_weights, style_shape
 from refu_core.body import Collider, SmplBody, load_body
 from refu_core.errors import RefuError
 from refu_core.frames import N_BETAS, N_JOINTS
@@ -289,6 +289,16 @@ def principal_components(values: Tensor, *, rank: int) -> tuple[Tensor, Tensor]:
         # Randomised: an exact decomposition takes 7 s for 3,000 samples and, growing with the cube, minutes for 12,000.
         _, _, components = torch.svd_lowrank(centred, q=min(rank + _SPARE, n), niter=4)
     return mean, components[:, :rank].T.contiguous()
+
+
+def smooth_components(values: Tensor, controls: Controls, *, rank: int) -> tuple[Tensor, Tensor]:
+    """As `principal_components`, at `controls`, (C, 3) and (R, 3 C), of what these can represent of `values`."""
+    smooth, triangle = torch.linalg.qr(controls.matrix())
+    at = torch.einsum("vc,nvk->nck", smooth, values)
+    mean, components = principal_components(at, rank=rank)  # orthonormal columns: as over all vertices
+    both = torch.cat((mean.flatten()[None], components)).view(-1, *mean.shape)
+    mean, components = torch.linalg.solve_triangular(triangle, both, upper=True).flatten(1).tensor_split((1,))
+    return mean.view(-1, 3), components
 
 
 def check_set(dataset: Rows, body: SmplBody, garment: GarmentTemplate) -> None:

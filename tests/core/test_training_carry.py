@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,21 @@ from small_set import write_set
 from torch import Tensor
 
 from refu_core import GarmentPipeline, RefuError, SmplFrame, load_body, load_garment
-from refu_core.backbones import Controls, PoseFeatures, load_backbone, load_basis, style_shape
+from refu_core.backbones import (
+    BasisDecoder,
+    Controls,
+    PoseFeatures,
+    WithBeyond,
+    load_backbone,
+    load_basis,
+    style_shape,
+)
 from refu_core.errors import WeightsError
 from refu_core.frames import LAGS, N_PAST
 from refu_core.garments import BUILTIN_GARMENTS, save_garment
 from refu_core.modes import SdfMode
-from refu_core.simulation import open_dataset
-from refu_core.training import CarrySettings, carry_over
+from refu_core.simulation import SamplePlan, open_dataset
+from refu_core.training import BeyondSettings, CarrySettings, LoopSettings, Rehearsal, carry_over, train_beyond
 from refu_core.training._carry import Carried, _Remainder, borne_out, own_codes
 from refu_core.training._data import displacements, posed_errors, read_samples
 from refu_core.weights import load_card, load_weights, weights_folder
@@ -42,15 +50,11 @@ def swelling(pose: Tensor) -> Tensor:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_set(
-        tmp_path_factory.mktemp("carried") / GARMENT,
-        load_garment(GARMENT),
-        load_body("neutral"),
-        pairs=8,
-        poses=4,
-        test_pairs=2,
-        displacement=swelling,
-    )
+    folder, garment = tmp_path_factory.mktemp("carried") / GARMENT, load_garment(GARMENT)
+    write_set(folder, garment, load_body("neutral"), pairs=8, poses=4, test_pairs=2, displacement=swelling)
+    card, plan = json.loads((folder / "card.json").read_text()), SamplePlan(GARMENT, 32, pivots=4, recorded_share=0.0)
+    (folder / "card.json").write_text(json.dumps(card | {"plan": asdict(plan)}))
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +159,25 @@ def test_every_mode_loads(made: Path) -> None:
         out = GarmentPipeline.load([GARMENT], sdf=mode, backbone="tailornet", weights=made)(SmplFrame(pose=ARMS_DOWN))
         assert np.isfinite(out[GARMENT].local).all()
         assert out.stats.garments[GARMENT].n_unresolved == 0 or mode is SdfMode.NONE
+
+
+def test_a_network_beside_it_is_stored_at_the_same_controls(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / GARMENT, tmp_path / "weights")
+    body = load_body("neutral")
+    lying = write_set(
+        tmp_path / "lying", load_garment(GARMENT), body, pairs=8, spread=0.8, turn=1.3, displacement=swelling
+    )
+    settings = BeyondSettings(LoopSettings(batch_size=8), steps=2, rank=4)
+    train_beyond("lying", GARMENT, lying, tmp_path / "weights", rehearsal=Rehearsal(8), settings=settings, quiet=True)
+    both = load_backbone("tailornet", GARMENT, mode="hybrid", folder=tmp_path / "weights")
+    assert isinstance(both, WithBeyond)
+    decoder = both.beyond[0].decoder
+    assert isinstance(decoder, BasisDecoder)
+    assert decoder.controls is not None
+    stored = load_weights(tmp_path / "weights" / "lying").tensors
+    assert torch.equal(stored["basis.controls"], load_weights(made / GARMENT / "basis").tensors["controls"])
+    assert not decoder.mean.any()
+    assert stored["basis.components"].shape == (4, 3 * SMALL.controls)
 
 
 def test_codes_are_turned_into_those_of_the_displacement_carried_over() -> None:
