@@ -107,8 +107,8 @@ def train_beyond(
         rehearsed = rehearsed.take(who(rehearsed.pose))
     owed[0] = torch.cat((owed[0], rehearsed.displacement))
     parts = [
-        (beyond.seen(one.betas, one.pose, one.style), decoder.encode(added))
-        for one, added in zip((train.joined(rehearsed), validation), owed, strict=True)
+        (beyond.seen(one.betas, one.pose, one.style), decoder.encode(wanted))
+        for one, wanted in zip((train.joined(rehearsed), validation), owed, strict=True)
     ]
     beyond.standardise(parts[0][0])
     described = {
