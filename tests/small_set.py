@@ -29,11 +29,12 @@ def write_set(
     spread: float = 0.2,
     turn: float | None = None,
     displacement: Callable[[Tensor], Tensor] | None = None,
+    plan: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes garments that follow the skin, displaced by a function of the poses (N, 24, 3) to (N, V, 3) [m].
 
     `pairs` style-shape pairs with `poses` poses each, whose angles spread by `spread` [rad], those of the root by
-    `turn`, if given; the last `test_pairs` are for the test.
+    `turn`, if given; the last `test_pairs` are for the test. `plan` is written into the card as what was drawn from.
     """
     rng = np.random.default_rng(0)
     n = pairs * poses
@@ -69,7 +70,7 @@ def write_set(
         "body": garment.body,
         "body_fingerprint": body.fingerprint,
         "quantum_m": QUANTUM,
-        "plan": {"count": n, "pivots": 4},
+        "plan": {"count": n, "pivots": 4} if plan is None else plan,
         "clips": {"train": [], "test": []},
     }
     return write_shard(folder, columns, card)

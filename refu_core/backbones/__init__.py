@@ -35,6 +35,7 @@ from refu_core.backbones._presets import build_backbone as build_backbone
 from refu_core.backbones._presets import carried_dynamics as carried_dynamics
 from refu_core.backbones._presets import load_backbone as load_backbone
 from refu_core.backbones._presets import load_basis as load_basis
+from refu_core.backbones._presets import load_beyond as load_beyond
 from refu_core.backbones._presets import require_basis as require_basis
 from refu_core.backbones._presets import save_backbone as save_backbone
 from refu_core.backbones._presets import save_basis as save_basis

@@ -301,11 +301,12 @@ def with_beyond(network: Backbone, weights: Weights, garment: GarmentTemplate) -
     if weights.card.get("backbone") != "tailornet" or not kinds:
         return network
     device = next(network.parameters()).device if isinstance(network, Module) else "cpu"
-    beyond = [_load_beyond(kind, weights, garment).to(device) for kind in kinds]
+    beyond = [load_beyond(kind, weights, garment).to(device) for kind in kinds]
     return WithBeyond(network, beyond).eval().requires_grad_(False)
 
 
-def _load_beyond(kind: str, weights: Weights, garment: GarmentTemplate) -> Beyond:
+def load_beyond(kind: str, weights: Weights, garment: GarmentTemplate) -> Beyond:
+    """A garment's network of a kind that is beside a tailornet's `weights`. Raises `WeightsError` as `with_beyond`."""
     stored = _load_beside(weights, kind)
     tensors = {k: v for k, v in stored.tensors.items() if not k.startswith(_BASIS)}
     with naming(stored.path):

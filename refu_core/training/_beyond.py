@@ -18,7 +18,7 @@ from refu_core.training import _data as data
 from refu_core.training._loop import Loop, LoopSettings, Objective, TrainingStage, is_writer, seeded, start_parallel
 from refu_core.training._loss import code_loss
 from refu_core.training._rehearsal import Rehearsal, plans_of
-from refu_core.weights import load_weights
+from refu_core.weights import load_card, load_weights
 
 
 @dataclass(frozen=True)
@@ -49,10 +49,12 @@ def train_beyond(
 ) -> dict[str, Any]:
     """Trains what is added to the garment's tailornet in `folder` in postures of a kind, and writes `folder`/<kind>.
 
-    Samples in other postures are left out. A network of that kind which is in `folder` already is gone on with: what it
-    adds to people of its plans is rehearsed. All else, and what is returned, is as in `pretrain`; figures stand beside
-    those of the tailornet alone. Raises `RefuError` as that does, for no such kind, and for too few people in such
-    postures to learn from or test on; `WeightsError` for no tailornet there, or a damaged one.
+    Samples in other postures are left out. A network of that kind which was trained beside that tailornet is gone on
+    with: what it adds to people of its plans is rehearsed. All else, and what is returned, is as in `pretrain`; figures
+    stand beside those of the tailornet alone.
+
+    Raises `RefuError` as that does, for no such kind, and for too few people in such postures to learn from or test on;
+    `WeightsError` for no tailornet there, or for one of the two networks that is damaged.
 
     Args:
         kind: `lying`, `legs` for thighs apart or drawn up or back, or `heels` for lower legs raised behind.
@@ -134,10 +136,10 @@ def train_beyond(
 def _earlier(
     kind: str, garment: GarmentTemplate, folder: Path, mode: str
 ) -> tuple[nets.Beyond | None, Mapping[str, Any]]:
-    """The network of a kind that is in a folder already, and its card; None and an empty card if there is none."""
+    """The network of a kind in a folder, and its card; None and an empty card if none goes with the tailornet there."""
     if not (folder / f"{kind}.json").exists():
         return None, {}
-    both = nets.load_backbone("tailornet", garment, mode=mode, folder=folder)
-    assert isinstance(both, nets.WithBeyond)  # there is one
-    found = {one.kind: one for one in both.beyond if isinstance(one, nets.Beyond)}[kind]
-    return found, load_weights(folder / kind).card
+    card, tailornet = load_card(folder / kind), load_weights(folder / f"tailornet-{mode}")
+    if card.get("tailornet_sha256") != tailornet.card["sha256"]:  # what it adds is added to another one
+        return None, {}
+    return nets.load_beyond(kind, tailornet, garment), card

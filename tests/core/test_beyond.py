@@ -188,31 +188,27 @@ def on_a_bed(pose: Tensor) -> Tensor:
     return 0.05 * up_in_root(pose)[:, 2:, None] * torch.tensor([1.0, 0.0, 0.0]).expand(len(pose), n, 3)
 
 
+def lying_set(folder: Path, seed: int, **how: Any) -> dict[str, Any]:
+    """A set of people turned in any direction, as if it were of a plan of people who lie; that plan."""
+    how = {"pairs": 60, "test_pairs": 8, "displacement": on_a_bed, **how}
+    count, garment = 4 * how["pairs"], load_garment(OWN)
+    plan = asdict(SamplePlan(OWN, count, seed=seed, recorded_share=0.0, posture_share=1.0, postures=LYING))
+    write_set(folder, garment, load_body(garment.body), poses=4, spread=0.8, turn=1.3, plan=plan, **how)
+    return plan
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights of shorts, learnt from people who stand, and a set of people who lie."""
     folder, garment = tmp_path_factory.mktemp("lying"), load_garment(OWN)
     body = load_body(garment.body)
-    write_set(folder / "standing", garment, body, pairs=12, poses=5, displacement=on_a_bed)
-    card = json.loads((folder / "standing" / "card.json").read_text())
     plan = asdict(SamplePlan(OWN, 60, pivots=4, recorded_share=0.0))
-    (folder / "standing" / "card.json").write_text(json.dumps(card | {"plan": plan}))
-    write_set(
-        folder / "lying", garment, body, pairs=60, poses=4, test_pairs=8, spread=0.8, turn=1.3, displacement=on_a_bed
-    )
+    write_set(folder / "standing", garment, body, pairs=12, poses=5, displacement=on_a_bed, plan=plan)
+    lying_set(folder / "lying", 1)
     loop = LoopSettings(batch_size=16, check_every=20)
     few = PretrainSettings(loop, rank=4, style_shape_steps=2, low_steps=2, steps=2)
     pretrain(OWN, folder / "standing", folder / "weights", settings=few, quiet=True)
     return folder
-
-
-def planned(source: Path, folder: Path, seed: int) -> tuple[Path, SamplePlan]:
-    """A copy of a set as if it were of a plan of people who lie, and that plan."""
-    card = json.loads((source / "card.json").read_text())
-    plan = SamplePlan(OWN, card["plan"]["count"], seed=seed, recorded_share=0.0, posture_share=1.0, postures=LYING)
-    shutil.copytree(source, folder)
-    (folder / "card.json").write_text(json.dumps(card | {"plan": asdict(plan)}))
-    return folder, plan
 
 
 def test_it_learns_what_a_backbone_cannot_know_and_comes_back_from_its_file(folder: Path) -> None:
@@ -227,18 +223,16 @@ def test_it_learns_what_a_backbone_cannot_know_and_comes_back_from_its_file(fold
     assert off[0] == 0
     assert float(off[1]) > 0.005
     assert card["rehearsed"] == {"count": 0, "plans": []}  # of those plans nobody lies
-    (folder / "weights" / "lying.json").unlink()
     again = train_beyond("lying", OWN, folder / "lying", folder / "weights", **how)
     assert again["figures"] == card["figures"]
 
 
 def test_it_is_gone_on_with(folder: Path, tmp_path: Path) -> None:
     """What was learnt from a set that isn't there any more is rehearsed, beside the few people of a new one."""
-    weights, garment = tmp_path / "weights", load_garment(OWN)
+    weights, lost, later = tmp_path / "weights", folder / "lying", tmp_path / "later"
     shutil.copytree(folder / "weights", weights, ignore=shutil.ignore_patterns("lying.*"))
-    write_set(tmp_path / "bare", garment, load_body(garment.body), pairs=6, poses=4, test_pairs=2, spread=0.8, turn=1.3)
-    lost, plan = planned(folder / "lying", tmp_path / "lost", 1)
-    later, _ = planned(tmp_path / "bare", tmp_path / "later", 2)
+    plan = json.loads((lost / "card.json").read_text())["plan"]
+    lying_set(later, 2, pairs=6, test_pairs=2, displacement=None)
     settings = BeyondSettings(LoopSettings(batch_size=32, learning_rate=3e-3), steps=300)
     how: dict[str, Any] = {"mode": "none", "rehearsal": Rehearsal(300), "settings": settings}
 
@@ -251,7 +245,7 @@ def test_it_is_gone_on_with(folder: Path, tmp_path: Path) -> None:
     train_beyond("lying", OWN, lost, weights, **how)
     before = added()
     card = train_beyond("lying", OWN, later, weights, **how)
-    assert json.loads(json.dumps(asdict(plan))) in json.loads(json.dumps(card["rehearsed"]["plans"]))
+    assert json.loads(json.dumps(card["rehearsed"]["plans"])) == [plan]
     assert card["rehearsed"]["count"] > 100
     off = (added() - before).norm()
     (weights / "lying.json").unlink()
@@ -262,10 +256,23 @@ def test_it_is_gone_on_with(folder: Path, tmp_path: Path) -> None:
 def test_nothing_is_rehearsed_where_all_plans_are_known(folder: Path, tmp_path: Path) -> None:
     weights = tmp_path / "weights"
     shutil.copytree(folder / "weights", weights, ignore=shutil.ignore_patterns("lying.*"))
-    lying, _ = planned(folder / "lying", tmp_path / "lying", 1)
     how: dict[str, Any] = {"mode": "none", "settings": BeyondSettings(LoopSettings(batch_size=32), steps=2)}
-    card = train_beyond("lying", OWN, [folder / "standing", lying], weights, rehearsal=Rehearsal(0), **how)
+    sets = [folder / "standing", folder / "lying"]
+    card = train_beyond("lying", OWN, sets, weights, rehearsal=Rehearsal(0), **how)
     assert card["rehearsed"] == {"count": 0, "plans": []}
+
+
+def test_one_that_went_with_another_tailornet_is_learnt_anew(folder: Path, tmp_path: Path) -> None:
+    weights, later = tmp_path / "weights", tmp_path / "later"
+    shutil.copytree(folder / "weights", weights, ignore=shutil.ignore_patterns("lying.*"))
+    how: dict[str, Any] = {"mode": "none", "settings": BeyondSettings(LoopSettings(batch_size=32), steps=2)}
+    train_beyond("lying", OWN, folder / "lying", weights, rehearsal=Rehearsal(9), **how)
+    card = json.loads((weights / "lying.json").read_text())
+    card |= {"tailornet_sha256": "0" * 64, "basis_sha256": "0" * 64}
+    (weights / "lying.json").write_text(json.dumps(card))
+    lying_set(later, 2, pairs=6, test_pairs=2)
+    assert train_beyond("lying", OWN, later, weights, rehearsal=Rehearsal(9), **how)["rehearsed"]["plans"] == []
+    load_backbone("tailornet", OWN, mode="none", folder=weights)
 
 
 def test_nobody_lies_in_a_set_of_people_who_stand(folder: Path) -> None:

@@ -50,11 +50,16 @@ def swelling(pose: Tensor) -> Tensor:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, garment = tmp_path_factory.mktemp("carried") / GARMENT, load_garment(GARMENT)
-    write_set(folder, garment, load_body("neutral"), pairs=8, poses=4, test_pairs=2, displacement=swelling)
-    card, plan = json.loads((folder / "card.json").read_text()), SamplePlan(GARMENT, 32, pivots=4, recorded_share=0.0)
-    (folder / "card.json").write_text(json.dumps(card | {"plan": asdict(plan)}))
-    return folder
+    return write_set(
+        tmp_path_factory.mktemp("carried") / GARMENT,
+        load_garment(GARMENT),
+        load_body("neutral"),
+        pairs=8,
+        poses=4,
+        test_pairs=2,
+        displacement=swelling,
+        plan=asdict(SamplePlan(GARMENT, 32, pivots=4, recorded_share=0.0)),
+    )
 
 
 @pytest.fixture(scope="module")
